@@ -1,0 +1,328 @@
+"""Interception tasks: a random map, a mission with deadlines that fit it, and starts from which the chase is fair.
+
+Families (what makes prediction matter, and what does not):
+
+``point``      the paper's missions; every goal is one small disc that a waiting ego covers.
+``perimeter``  the last goal is a disc wider than the interception radius: a control.
+``ambiguous``  the goal is any of several: whoever waits at one of them may wait in vain.
+
+Deadlines are `slack` times the shortest time to the farthest way of completing the mission. Every task can be won: an ego
+that knew the adversary's shortest path (to each alternative goal) could meet it on the way.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import permutations
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tab_marl.mission.model import Constraint, ConstraintType, Mission, Place
+from tab_marl.world.grid import GridMap
+from tab_marl.world.sampling import PLANNING_CELL_METRES, MapOptions, sample_disc, sample_scenario
+from tab_marl.world.scenario import STRICT, Scenario, UnknownName
+
+MISSION_IDS = ("M1", "M2", "M3", "M4", "M5")
+FAMILIES = ("point", "perimeter", "ambiguous")
+
+SLACK_RANGE = (1.2, 2.5)
+TURN_SECONDS = 1.0
+"""Allowance for turning, once per leg: a Burger turns by 90 degrees in 0.9 s."""
+START_RADIUS_METRES = 0.15
+FAR_METRES = 1.0
+"""The adversary starts at least this far from its first goal and from the ego."""
+PURSUIT_SECONDS = 10.0
+"""The episode goes on this long after the last moment at which the mission can be completed."""
+TURN_BACK_SECONDS = 4.5
+"""Leaving a disc, turning round and coming back, for recurring visits."""
+PERIMETER_METRES = (0.45, 0.6)
+MAPS = 200
+"""Maps tried before a task is given up."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What one episode is about."""
+
+    scenario: Scenario
+    mission: Mission
+    mission_id: str
+    family: str
+    slack: float
+    """Allowed time / shortest time."""
+
+    __pydantic_config__: ClassVar = STRICT
+
+
+def sample_task(
+    rng: np.random.Generator,
+    mission_id: str = "M1",
+    family: str = "point",
+    slack: float | None = None,
+    options: MapOptions | None = None,
+) -> Task:
+    """Draw a task. `slack` None draws it uniformly from SLACK_RANGE. Raises UnknownName for a wrong id or family."""
+    if mission_id not in MISSION_IDS:
+        raise UnknownName("mission type", mission_id, MISSION_IDS)
+    if family not in FAMILIES:
+        raise UnknownName("scenario family", family, FAMILIES)
+    if slack is not None and not slack > 1:
+        raise ValueError(f"slack is {slack}, must be > 1 (allowed time / shortest time)")
+    for _ in range(MAPS):
+        drawn = float(rng.uniform(*SLACK_RANGE)) if slack is None else slack
+        task = _attempt(rng, mission_id, family, drawn, options)
+        if task is not None:
+            return task
+    raise RuntimeError(f"no winnable {family} {mission_id} task with slack {slack} found on {MAPS} maps")
+
+
+def _attempt(
+    rng: np.random.Generator, mission_id: str, family: str, slack: float, options: MapOptions | None
+) -> Task | None:
+    scenario = sample_scenario(rng, options, name=f"{mission_id}-{family}")
+    if family == "perimeter":
+        scenario = _widen(rng, scenario, mission_id)
+        if scenario is None:
+            return None
+    legs = _legs(rng, scenario, mission_id, family)
+    if legs is None:
+        return None
+    grid = GridMap.from_scenario(scenario, PLANNING_CELL_METRES)
+    travel = _Travel(scenario, grid, avoid_centre=mission_id in ("M4", "M5"))
+    first = [travel.region(place) for place in legs[0]]
+    clear = scenario.adversary.radius_metres + START_RADIUS_METRES
+
+    def far_from_goals(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        ok = np.min([region.distance(points) for region in first], axis=0) >= FAR_METRES
+        if travel.avoid_centre:
+            ok &= scenario.region("central zone").distance(points) >= clear
+        return np.asarray(ok)
+
+    start = sample_disc(rng, grid, START_RADIUS_METRES, far_from_goals)
+    if start is None:
+        return None
+    ways = travel.ways(start.centre, legs, mission_id)
+    if not ways or not all(math.isfinite(way.seconds) for way in ways):
+        return None
+    mission, horizon = _mission(mission_id, legs, travel, ways, slack)
+    meets = np.all([travel.ego_meets(way.path) for way in ways], axis=0)
+
+    def fair(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        apart = np.hypot(points[:, 0] - start.x, points[:, 1] - start.y) >= FAR_METRES
+        return np.asarray(meets & apart)
+
+    ego = sample_disc(rng, grid, 0.05, fair)
+    if ego is None:
+        return None
+    scenario = replace(scenario, ego_start=ego, adversary_start=start, horizon_seconds=horizon)
+    return Task(scenario, mission, mission_id, family, round(slack, 3))
+
+
+def _widen(rng: np.random.Generator, scenario: Scenario, mission_id: str) -> Scenario | None:
+    """Make the last goal wider than the interception radius, if the map leaves room for it."""
+    radius = round(float(rng.uniform(*PERIMETER_METRES)), 2)
+    if mission_id == "M5":
+        return replace(scenario, target_radius_metres=radius)
+    index = 1 if mission_id == "M2" else 0
+    goal = replace(scenario.checkpoints[index], radius_metres=radius, camera_metres=round(radius + 0.15, 2))
+    others = [c for i, c in enumerate(scenario.checkpoints) if i != index]
+    if any(math.hypot(goal.x - c.x, goal.y - c.y) < radius + c.radius_metres + 0.2 for c in others):
+        return None
+    if scenario.region("central zone").distance([[goal.x, goal.y]])[0] < radius + 0.1 and mission_id == "M4":
+        return None
+    checkpoints = list(scenario.checkpoints)
+    checkpoints[index] = goal
+    return replace(scenario, checkpoints=tuple(checkpoints))
+
+
+def _legs(
+    rng: np.random.Generator, scenario: Scenario, mission_id: str, family: str
+) -> list[tuple[Place, ...]] | None:
+    """The goals in order, each as the tuple of places of which one will do."""
+    names: list[Place] = [c.name for c in scenario.checkpoints]
+    several = family == "ambiguous"
+    if mission_id == "M2":
+        return [tuple(names[:2]), tuple(names[2:4])] if several else [(names[0],), (names[1],)]
+    if mission_id == "M5":
+        targets = _targets(rng, scenario, 3 if several else 1)
+        return None if targets is None else [tuple(names), targets]
+    return [tuple(names[:4])] if several else [(names[0],)]
+
+
+def _targets(rng: np.random.Generator, scenario: Scenario, count: int) -> tuple[Place, ...] | None:
+    """Bare target points, clear of checkpoints, obstacles, walls and the central zone."""
+    radius = scenario.target_radius_metres
+    grid = GridMap.from_scenario(scenario, PLANNING_CELL_METRES)
+    ok = scenario.region("central zone").distance(grid.centres) >= radius + 0.1
+    for c in scenario.checkpoints:
+        ok &= c.region.distance(grid.centres) >= radius + 0.15
+    if radius < scenario.interception_metres:  # a wide target may reach under an obstacle, a small one may not
+        for obstacle in scenario.obstacles:
+            ok &= obstacle.distance(grid.centres) >= radius + 0.105
+    chosen: list[Place] = []
+    for _ in range(count):
+        candidates = np.flatnonzero(ok)
+        if len(candidates) == 0:
+            return None
+        x, y = grid.centres[rng.choice(candidates)]
+        chosen.append((round(float(x), 2), round(float(y), 2)))
+        ok &= np.hypot(grid.centres[:, 0] - x, grid.centres[:, 1] - y) >= 0.8
+    return tuple(chosen)
+
+
+@dataclass(frozen=True)
+class _Way:
+    """One shortest way of completing the mission: the time it takes, its longest leg, and where it is at each tick."""
+
+    seconds: float
+    longest_leg_seconds: float
+    path: NDArray[np.float64]
+    """``[ticks + 1, 2]`` metres."""
+
+
+class _Travel:
+    """Shortest paths of one adversary on one map."""
+
+    def __init__(self, scenario: Scenario, grid: GridMap, avoid_centre: bool) -> None:
+        self.scenario, self.grid, self.avoid_centre = scenario, grid, avoid_centre
+        # Walking through the zone costs so much that a path avoids it wherever it can; a path that cannot is refused.
+        zone = grid.inside(scenario.region("central zone"))
+        self._cost = np.where(zone, 1e6, 1.0) if avoid_centre else None
+        self._from: dict[tuple[Place, ...], NDArray[np.float64]] = {}
+
+    def region(self, place: Place) -> object:
+        from tab_marl.mission.model import place_region
+
+        return place_region(place, self.scenario)
+
+    def to(self, places: tuple[Place, ...]) -> NDArray[np.float64]:
+        """``[S]`` metres to the nearest cell of these places."""
+        if places not in self._from:
+            inside = np.any([self.grid.inside(self.region(p)) for p in places], axis=0)  # type: ignore[arg-type]
+            sources = np.flatnonzero(inside)
+            self._from[places] = (
+                self.grid.distances(sources, self._cost) if len(sources) else np.full(self.grid.cells, np.inf)
+            )
+        return self._from[places]
+
+    def ways(self, start: tuple[float, float], legs: list[tuple[Place, ...]], mission_id: str) -> list[_Way]:
+        """The shortest way for each choice of last goal (M2: of both goals; M5: over the best three checkpoints)."""
+        if mission_id == "M2":
+            orders = [(a, b) for a in legs[0] for b in legs[1]]
+        elif mission_id == "M5":
+            orders = [self._best_three(start, legs[0], target) for target in legs[1]]
+        else:
+            orders = [(goal,) for goal in legs[0]]
+        return [self._walk(start, order) for order in orders]
+
+    def _best_three(self, start: tuple[float, float], names: tuple[Place, ...], target: Place) -> tuple[Place, ...]:
+        def length(order: tuple[Place, ...]) -> float:
+            cell, total = int(self.grid.cells_of([start])[0]), 0.0
+            for place in order:
+                total += float(self.to((place,))[cell])
+                cell = int(self.grid.cells_of([self.region(place).centre])[0])  # type: ignore[attr-defined]
+            return total
+
+        return min(((*three, target) for three in permutations(names, 3)), key=length)
+
+    def _walk(self, start: tuple[float, float], order: tuple[Place, ...]) -> _Way:
+        """Descend the distance to each goal in turn, one leg after the other, at full speed."""
+        speed, step = self.scenario.adversary.max_speed, self.scenario.step_seconds
+        cell = int(self.grid.cells_of([start])[0])
+        points, times, longest = [self.grid.centres[cell]], [0.0], 0.0
+        for place in order:
+            distance = self.to((place,))
+            if not distance[cell] < 1e4:
+                return _Way(math.inf, math.inf, np.zeros((1, 2)))
+            leg = TURN_SECONDS + float(distance[cell]) / speed
+            longest = max(longest, leg)
+            points.append(points[-1])
+            times.append(times[-1] + TURN_SECONDS)
+            while distance[cell] > 0:
+                near = np.flatnonzero(
+                    (abs(self.grid.row - self.grid.row[cell]) <= 2)
+                    & (abs(self.grid.column - self.grid.column[cell]) <= 2)
+                )
+                gap = np.hypot(*(self.grid.centres[near] - self.grid.centres[cell]).T)
+                rate = (distance[cell] - distance[near]) / np.maximum(gap, 1e-9)
+                best = int(near[np.argmax(np.where(gap > 0, rate, -np.inf))])
+                times.append(times[-1] + float(distance[cell] - distance[best]) / speed)
+                cell = best
+                points.append(self.grid.centres[cell])
+        ticks = np.arange(0.0, times[-1] + step, step)
+        track = np.asarray(points)
+        path = np.stack([np.interp(ticks, times, track[:, 0]), np.interp(ticks, times, track[:, 1])], axis=1)
+        return _Way(times[-1], longest, path)
+
+    def ego_meets(self, path: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """``[S]``: from which cells an ego that knew this path could be within reach of it in time."""
+        ego, step = self.scenario.ego, self.scenario.step_seconds
+        free = GridMap.from_scenario(self.scenario, PLANNING_CELL_METRES, ego.radius_metres)
+        meets = np.zeros(self.grid.cells, dtype=bool)
+        for tick in range(2, len(path), 2):
+            distance = free.distances(free.cells_of([path[tick]]))[free.cells_of(self.grid.centres)]
+            arrival = TURN_SECONDS + (distance - self.scenario.interception_metres) / ego.max_speed
+            meets |= arrival <= tick * step
+        return meets
+
+
+def _halves(seconds: float) -> float:
+    """Up to the next half second, so that the mission reads well."""
+    return math.ceil(2 * seconds - 1e-9) / 2
+
+
+def _mission(
+    mission_id: str, legs: list[tuple[Place, ...]], travel: _Travel, ways: list[_Way], slack: float
+) -> tuple[Mission, float]:
+    """The mission with its deadlines, and the episode's horizon in seconds."""
+    longest = max(way.seconds for way in ways)
+    allowed = _halves(slack * longest)
+    avoid_centre = Constraint(ConstraintType.ALWAYS, ("central zone",), avoid=True)
+    reach = ConstraintType.DEADLINE
+    if mission_id == "M1":
+        goals: tuple[Constraint, ...] = (Constraint(reach, legs[0], seconds=allowed),)
+        end = allowed
+    elif mission_id == "M2":
+        goals = (
+            Constraint(ConstraintType.EVENTUALLY, legs[0]),
+            Constraint(ConstraintType.EXACT, legs[1], seconds=allowed),
+        )
+        end = allowed + max(travel.scenario.exact_seconds, travel.scenario.exact_fraction * allowed)
+    elif mission_id == "M3":
+        period = _halves(slack * max(longest, TURN_BACK_SECONDS + TURN_SECONDS))
+        goals = (Constraint(reach, legs[0], seconds=period, recurrences=3),)
+        end = 3 * period
+    elif mission_id == "M4":
+        # Unbounded: it ends at the episode's horizon, which is therefore the allowed time.
+        return Mission((Constraint(ConstraintType.EVENTUALLY, legs[0]), avoid_centre), "M4"), allowed
+    else:
+        gap = _halves(slack * max(way.longest_leg_seconds for way in ways))
+        goals = (
+            Constraint(ConstraintType.EVENTUALLY, legs[0], different=3, max_gap_seconds=gap),
+            Constraint(ConstraintType.EVENTUALLY, legs[1], max_gap_seconds=gap),
+            avoid_centre,
+        )
+        end = 4 * gap
+    return Mission(goals, mission_id), _halves(end + PURSUIT_SECONDS)
+
+
+@lru_cache(maxsize=1024)
+def ego_can_be_first(task: Task) -> bool:
+    """Whether the last goal is one small disc that the ego reaches, and covers, before the adversary possibly can."""
+    goals = [c for c in task.mission.constraints if c.type not in (ConstraintType.ALWAYS, ConstraintType.UNTIL)]
+    if len(goals[-1].places) != 1 or task.family == "perimeter":
+        return False
+    scenario = task.scenario
+    grid = GridMap.from_scenario(scenario, PLANNING_CELL_METRES)
+    travel = _Travel(scenario, grid, avoid_centre=task.mission_id in ("M4", "M5"))
+    ways = travel.ways(scenario.adversary_start.centre, [g.places for g in goals], task.mission_id)
+    shortest = min(way.seconds for way in ways) - 3 * TURN_SECONDS - START_RADIUS_METRES / scenario.adversary.max_speed
+    place = travel.region(goals[-1].places[0])
+    free = GridMap.from_scenario(scenario, PLANNING_CELL_METRES, scenario.ego.radius_metres)
+    distance = free.distances(free.cells_of([place.centre]))  # type: ignore[attr-defined]
+    ego = float(distance[free.cells_of([scenario.ego_start.centre])[0]])
+    return 2 * TURN_SECONDS + ego / scenario.ego.max_speed <= shortest
