@@ -31,7 +31,9 @@ class HandMade:
 
     def masks(self, points):
         p = np.atleast_2d(points)
-        return sum((r.contains(p).astype(np.int32) << i for i, r in enumerate(self.regions)), np.zeros(len(p), np.int32))
+        return sum(
+            (r.contains(p).astype(np.int32) << i for i, r in enumerate(self.regions)), np.zeros(len(p), np.int32)
+        )
 
 
 def in_order(goals, avoid=()):
