@@ -93,7 +93,7 @@ def _attempt(
         return None
     grid = GridMap.from_scenario(scenario, PLANNING_CELL_METRES)
     travel = _Travel(scenario, grid, avoid_centre=mission_id in ("M4", "M5"))
-    first = [travel.region(place) for place in legs[0]]
+    first = [scenario.place(place) for place in legs[0]]
     clear = scenario.adversary.radius_metres + START_RADIUS_METRES
 
     def far_from_goals(points: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -139,9 +139,7 @@ def _widen(rng: np.random.Generator, scenario: Scenario, mission_id: str) -> Sce
     return replace(scenario, checkpoints=tuple(checkpoints))
 
 
-def _legs(
-    rng: np.random.Generator, scenario: Scenario, mission_id: str, family: str
-) -> list[tuple[Place, ...]] | None:
+def _legs(rng: np.random.Generator, scenario: Scenario, mission_id: str, family: str) -> list[tuple[Place, ...]] | None:
     """The goals in order, each as the tuple of places of which one will do."""
     names: list[Place] = [c.name for c in scenario.checkpoints]
     several = family == "ambiguous"
@@ -194,15 +192,10 @@ class _Travel:
         self._cost = np.where(zone, 1e6, 1.0) if avoid_centre else None
         self._from: dict[tuple[Place, ...], NDArray[np.float64]] = {}
 
-    def region(self, place: Place) -> object:
-        from tab_marl.mission.model import place_region
-
-        return place_region(place, self.scenario)
-
     def to(self, places: tuple[Place, ...]) -> NDArray[np.float64]:
         """``[S]`` metres to the nearest cell of these places."""
         if places not in self._from:
-            inside = np.any([self.grid.inside(self.region(p)) for p in places], axis=0)  # type: ignore[arg-type]
+            inside = np.any([self.grid.inside(self.scenario.place(p)) for p in places], axis=0)
             sources = np.flatnonzero(inside)
             self._from[places] = (
                 self.grid.distances(sources, self._cost) if len(sources) else np.full(self.grid.cells, np.inf)
@@ -224,7 +217,7 @@ class _Travel:
             cell, total = int(self.grid.cells_of([start])[0]), 0.0
             for place in order:
                 total += float(self.to((place,))[cell])
-                cell = int(self.grid.cells_of([self.region(place).centre])[0])  # type: ignore[attr-defined]
+                cell = int(self.grid.cells_of([self.scenario.place(place).centre])[0])
             return total
 
         return min(((*three, target) for three in permutations(names, 3)), key=length)
@@ -313,7 +306,7 @@ def _mission(
 @lru_cache(maxsize=1024)
 def ego_can_be_first(task: Task) -> bool:
     """Whether the last goal is one small disc that the ego reaches, and covers, before the adversary possibly can."""
-    goals = [c for c in task.mission.constraints if c.type not in (ConstraintType.ALWAYS, ConstraintType.UNTIL)]
+    goals = task.mission.goals
     if len(goals[-1].places) != 1 or task.family == "perimeter":
         return False
     scenario = task.scenario
@@ -321,8 +314,8 @@ def ego_can_be_first(task: Task) -> bool:
     travel = _Travel(scenario, grid, avoid_centre=task.mission_id in ("M4", "M5"))
     ways = travel.ways(scenario.adversary_start.centre, [g.places for g in goals], task.mission_id)
     shortest = min(way.seconds for way in ways) - 3 * TURN_SECONDS - START_RADIUS_METRES / scenario.adversary.max_speed
-    place = travel.region(goals[-1].places[0])
+    place = scenario.place(goals[-1].places[0])
     free = GridMap.from_scenario(scenario, PLANNING_CELL_METRES, scenario.ego.radius_metres)
-    distance = free.distances(free.cells_of([place.centre]))  # type: ignore[attr-defined]
+    distance = free.distances(free.cells_of([place.centre]))
     ego = float(distance[free.cells_of([scenario.ego_start.centre])[0]])
     return 2 * TURN_SECONDS + ego / scenario.ego.max_speed <= shortest

@@ -240,6 +240,12 @@ class Scenario:
             raise UnknownName("region", name, spellings.values())
         return dict(self.named_regions())[canonical]
 
+    def place(self, place: str | tuple[float, float]) -> Region:
+        """The region of a name, or the goal disc around a bare target point."""
+        if isinstance(place, str):
+            return self.region(place)
+        return Disc(place[0], place[1], self.target_radius_metres)
+
     def seen(self, points: object) -> np.ndarray:
         """``[N]`` bool: which points ``[N, 2]`` lie inside some camera disc."""
         array = np.asarray(points, dtype=np.float64)
