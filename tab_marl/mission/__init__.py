@@ -1,0 +1,32 @@
+"""Missions: constraint tuples, their timed automaton, its unrolled form."""
+
+from tab_marl.mission.automaton import (
+    ALWAYS_FORBIDDEN,
+    COMPLETED,
+    FAILED,
+    NO_BRANCH,
+    UNBOUNDED,
+    AutomatonState,
+    MissionAutomaton,
+)
+from tab_marl.mission.compile import compile_mission
+from tab_marl.mission.model import Constraint, ConstraintType, Mission, Place, place_name
+from tab_marl.mission.unroll import TickAutomaton, unroll
+
+__all__ = [
+    "ALWAYS_FORBIDDEN",
+    "COMPLETED",
+    "FAILED",
+    "NO_BRANCH",
+    "UNBOUNDED",
+    "AutomatonState",
+    "Constraint",
+    "ConstraintType",
+    "Mission",
+    "MissionAutomaton",
+    "Place",
+    "TickAutomaton",
+    "compile_mission",
+    "place_name",
+    "unroll",
+]
