@@ -1,0 +1,31 @@
+"""What a user did that cannot work, in one line that says what to do instead."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+
+
+class UserError(Exception):
+    """Shown on one line without a traceback; the command ends with a status other than 0."""
+
+
+class Interrupted(Exception):
+    """The run was asked to stop; what was finished is stored."""
+
+
+def require_known(kind: str, names: Sequence[str], known: Iterable[str]) -> tuple[str, ...]:
+    """The names in their own spelling, case and order as given. Raises UserError with the nearest known name."""
+    table = {name.casefold(): name for name in known}
+    found = []
+    for name in names:
+        match = table.get(name.casefold())
+        if match is None:
+            close = difflib.get_close_matches(name.casefold(), table, n=1, cutoff=0.4)
+            hint = f"did you mean {table[close[0]]!r}?" if close else f"known: {', '.join(table.values())}"
+            raise UserError(f"no {kind} named {name!r}: {hint}")
+        found.append(match)
+    repeated = sorted({name for name in found if found.count(name) > 1})
+    if repeated:
+        raise UserError(f"{kind} {', '.join(repeated)} is named twice")
+    return tuple(found)

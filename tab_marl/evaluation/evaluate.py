@@ -1,0 +1,139 @@
+"""The whole evaluation: settings to rows, tables and report, with progress for the person who waits."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from tab_marl.evaluation.errors import Interrupted, UserError, require_known
+from tab_marl.evaluation.rows import EpisodeRow
+from tab_marl.evaluation.runner import Play, Result, run
+from tab_marl.evaluation.settings import EvaluationSettings, settings_key
+from tab_marl.evaluation.store import Store
+
+REPORT_NAME = "report.html"
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """Settings together with what this machine's code and zoo make of them."""
+
+    settings: EvaluationSettings
+    adversaries: tuple[str, ...]
+    code: str
+
+    @property
+    def content(self) -> dict[str, object]:
+        return self.settings.content(self.code, self.adversaries)
+
+    @property
+    def key(self) -> str:
+        return settings_key(self.content)
+
+
+def prepare(settings: EvaluationSettings) -> Experiment:
+    """Resolve the adversaries and the code's fingerprint. Raises UserError for a policy that the zoo lacks."""
+    from tab_marl.evaluation.episode import zoo_names
+    from tab_marl.evaluation.settings import code_fingerprint
+
+    known = zoo_names()
+    if not known:
+        raise UserError("the zoo holds no adversary: train one with tab-marl train")
+    chosen = require_known("adversary", settings.adversaries, known) if settings.adversaries else known
+    return Experiment(settings, chosen, code_fingerprint())
+
+
+def play_missing(experiment: Experiment, store: Store, play: Play, console: Console, hint: str) -> None:
+    """Play what the store lacks. Raises UserError, saying how to continue, if interrupted."""
+    settings = experiment.settings
+    requested = dataclasses.asdict(settings)
+    store.use(experiment.key, experiment.content, requested)
+    done = _count_done(experiment, store)
+    if done == settings.total:
+        console.print(f"all {settings.total} episodes are already stored in {store.path}", highlight=False)
+        return
+    if done:
+        console.print(f"{done} of {settings.total} episodes are already stored; playing the rest", highlight=False)
+    others = [s for s in store.settings() if s.key != experiment.key and s.rows]
+    if others:
+        console.print(
+            f"{sum(s.rows for s in others)} episodes of {len(others)} other settings lie in {store.path} and are kept apart",
+            highlight=False,
+        )
+    if first_use():
+        console.print(
+            "First use: compiling the numerical kernels takes a minute or two; later runs skip this.", highlight=False
+        )
+    try:
+        with _progress(console, settings.total, done) as advance:
+            run(settings, experiment.adversaries, store, experiment.key, play, advance)
+    except Interrupted:
+        stored = _count_done(experiment, store)
+        raise UserError(f"interrupted: {stored} of {settings.total} episodes are stored; to continue: {hint}") from None
+
+
+def rows_of(settings: EvaluationSettings, store: Store, key: str) -> list[EpisodeRow]:
+    """The stored rows that these settings ask for."""
+    return [
+        row
+        for row in store.rows(key)
+        if row.mission in settings.missions
+        and row.family in settings.families
+        and row.planner in settings.planners
+        and row.seed < settings.episodes
+    ]
+
+
+def first_use() -> bool:
+    """Whether no compiled kernel of this package lies in the usual cache yet."""
+    import os
+
+    import tab_marl
+
+    if os.environ.get("NUMBA_CACHE_DIR"):
+        return not any(Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*.nbi"))
+    return not any((Path(tab_marl.__file__).parent / "planning").rglob("*.nbi"))
+
+
+def _count_done(experiment: Experiment, store: Store) -> int:
+    s = experiment.settings
+    return sum(
+        m in s.missions and f in s.families and p in s.planners and seed < s.episodes
+        for m, f, p, seed in store.keys(experiment.key)
+    )
+
+
+class _progress:
+    """A bar with an estimate on a terminal; elsewhere a line each tenth of the way."""
+
+    def __init__(self, console: Console, total: int, done: int) -> None:
+        self.console, self.total, self.done, self.failed = console, total, done, 0
+        self.next_line = done + max(1, total // 10)
+        self.bar = Progress(
+            TextColumn("episodes"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+            TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[note]}"), console=console,
+        ) if console.is_terminal else None  # fmt: skip
+
+    def __enter__(self) -> Callable[[list[Result]], None]:
+        if self.bar is not None:
+            self.bar.start()
+            self.task = self.bar.add_task("", total=self.total, completed=self.done, note="starting workers")
+        return self.advance
+
+    def __exit__(self, *_: object) -> None:
+        if self.bar is not None:
+            self.bar.stop()
+
+    def advance(self, results: list[Result]) -> None:
+        self.done += len(results)
+        self.failed += sum(row.error is not None for row, _ in results)
+        note = f"{self.failed} broke down" if self.failed else ""
+        if self.bar is not None:
+            self.bar.update(self.task, completed=self.done, note=note)
+        elif self.done >= self.next_line or self.done == self.total:
+            self.next_line = self.done + max(1, self.total // 10)
+            self.console.print(f"{self.done} of {self.total} episodes {note}".rstrip(), highlight=False)
