@@ -1,0 +1,187 @@
+"""The compiled POMCP search: one function, compiled once per type of model data and cached on disk.
+
+The model enters as first-class function types (numba passes a pointer with a known signature), never as a jitted function or
+a closure, which would compile anew in every process. Nothing here raises; `tab_marl.planning.pomcp` validates, and
+`tab_marl.planning.interpreted` is the slow twin that must build the identical tree.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from tab_marl.planning.random_kernels import GOLDEN, below, mixed
+
+NO_CHILD = -1
+NO_SIBLING = -1
+UNEXPANDED = -1
+FORBIDDEN = -1
+
+# What `used` counts.
+NODES, EDGES, DEEPEST, TREE_STEPS, ROLLOUT_STEPS = 0, 1, 2, 3, 4
+
+
+@njit(cache=True, nogil=True)
+def select(nodes, edges, node, exploration, rng):
+    """The edge to follow from an expanded node: an untried one at random, else the greatest upper bound (UCB1)."""
+    first = nodes[node].first_edge
+    count = nodes[node].edge_count
+    factor = exploration * math.sqrt(math.log(nodes[node].visits))
+    untried = 0
+    best = first
+    best_score = -math.inf
+    for edge in range(first, first + count):
+        visits = edges[edge].visits
+        if visits == 0:
+            untried += 1
+        elif untried == 0:
+            score = edges[edge].value + factor / math.sqrt(visits)
+            if score > best_score:
+                best_score = score
+                best = edge
+    if untried == 0:
+        return best
+    chosen = below(rng, untried)
+    for edge in range(first, first + count):
+        if edges[edge].visits == 0:
+            if chosen == 0:
+                return edge
+            chosen -= 1
+    return best
+
+
+@njit(cache=True, nogil=True)
+def expand(
+    prior, data, state, action, observation, depth, actions, nodes, edges, edge_actions, used, node, values, counts
+):
+    """Gives the node its edges: all actions, or those the model's prior does not forbid, with its values and pseudo-counts."""
+    first = used[EDGES]
+    edge = first
+    if prior is None:
+        for a in range(actions):
+            edges[edge].value = 0.0
+            edges[edge].visits = 0
+            edges[edge].child = NO_CHILD
+            edge_actions[edge] = a
+            edge += 1
+    else:
+        values[:] = 0.0
+        counts[:] = 0
+        prior(state, action, observation, depth, data, values, counts)
+        for a in range(actions):
+            if counts[a] >= 0:
+                edges[edge].value = values[a]
+                edges[edge].visits = counts[a]
+                edges[edge].child = NO_CHILD
+                edge_actions[edge] = a
+                nodes[node].visits += counts[a]
+                edge += 1
+    nodes[node].first_edge = first
+    nodes[node].edge_count = edge - first
+    used[EDGES] = edge
+
+
+@njit(cache=True, nogil=True)
+def find_child(nodes, edges, edge, observation):
+    """The node reached by this edge and observation, or NO_CHILD."""
+    child = edges[edge].child
+    while child >= 0 and nodes[child].observation != observation:
+        child = nodes[child].sibling
+    return child
+
+
+@njit(cache=True, nogil=True)
+def random_rollout(step, data, state, depth, max_depth, discount, actions, rng, model_rng, used):
+    """The discounted return of uniformly random actions until the end, counted from now."""
+    total = 0.0
+    weight = 1.0
+    for _ in range(depth, max_depth):
+        _observation, reward, terminal = step(state, below(rng, actions), data, model_rng)
+        used[ROLLOUT_STEPS] += 1
+        total += weight * reward
+        if terminal:
+            break
+        weight *= discount
+    return total
+
+
+@njit(cache=True, nogil=True)
+def search(
+    step, rollout, prior, data, states, particles, seeds, actions, exploration, discount, max_depth, tree_depth,
+    may_grow, nodes, edges, edge_actions, used, rng, model_rng, state, path_edges, path_rewards, values, counts,
+):  # fmt: skip
+    """Simulations from `particles` [n] (rows of `states` [P, D]) until done or until the arrays are full and may grow.
+
+    `seeds` uint64[P]: the model's randomness at each depth of a particle's simulation (empty: a fresh stream throughout).
+    Returns how many simulations were run. The root (node 0) is expanded by the caller.
+    """
+    last_action = np.int64(-1)
+    size = states.shape[1]
+    for i in range(len(particles)):
+        room = used[NODES] < len(nodes) and used[EDGES] + actions <= len(edges)
+        if may_grow and not room:
+            return i
+        particle = particles[i]
+        for d in range(size):
+            state[d] = states[particle, d]
+        node = np.int64(0)
+        depth = 0
+        leaf = 0.0
+        last_action = np.int64(-1)
+        observation = np.int64(0)
+        while True:
+            nodes[node].visits += 1
+            if nodes[node].edge_count == 0:
+                # Every action is forbidden here (or the root has none): the leaf estimate stands for what follows.
+                leaf_needed = True
+                break
+            edge = select(nodes, edges, node, exploration, rng)
+            action = np.int64(edge_actions[edge])
+            if len(seeds) > 0:
+                model_rng[0] = mixed(seeds[particle] + np.uint64(depth) * GOLDEN)
+            observation, reward, terminal = step(state, action, data, model_rng)
+            last_action = action
+            path_edges[depth] = edge
+            path_rewards[depth] = reward
+            depth += 1
+            leaf_needed = False
+            if terminal or depth == max_depth:
+                break
+            child = find_child(nodes, edges, edge, observation)
+            leaf_needed = True
+            if child < 0:
+                if room and depth <= tree_depth:
+                    child = used[NODES]
+                    used[NODES] += 1
+                    nodes[child].observation = observation
+                    nodes[child].sibling = edges[edge].child
+                    nodes[child].visits = 1
+                    nodes[child].first_edge = UNEXPANDED
+                    nodes[child].edge_count = 0
+                    edges[edge].child = child
+                break
+            if nodes[child].first_edge == UNEXPANDED:
+                # Edges are made at the second visit: most nodes are visited once, and memory is what large trees wait for.
+                if not room:
+                    nodes[child].visits += 1
+                    break
+                expand(prior, data, state, action, observation, depth, actions, nodes, edges, edge_actions, used,
+                       child, values, counts)  # fmt: skip
+            node = child
+        used[TREE_STEPS] += depth
+        used[DEEPEST] = max(used[DEEPEST], depth)
+        if leaf_needed:
+            if len(seeds) > 0:
+                model_rng[0] = mixed(seeds[particle] + np.uint64(depth) * GOLDEN)
+            if rollout is None:
+                leaf = random_rollout(step, data, state, depth, max_depth, discount, actions, rng, model_rng, used)
+            else:
+                leaf = rollout(state, last_action, observation, depth, max_depth, discount, data, model_rng)
+        for d in range(depth - 1, -1, -1):
+            leaf = path_rewards[d] + discount * leaf
+            edge = path_edges[d]
+            edges[edge].visits += 1
+            edges[edge].value += (leaf - edges[edge].value) / edges[edge].visits
+    return len(particles)

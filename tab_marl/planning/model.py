@@ -1,0 +1,264 @@
+"""Generative models for the planner: compiled functions, tables, or a plain Python class; and beliefs over their states.
+
+**Compiled** (`CompiledModel`): module-level Python functions that numba can compile,
+
+``step(state, action, data, rng) -> (observation, reward, terminal)``
+    Changes `state` in place. `state` is float64[D]: a short vector holds a cell number, a bit mask (exact up to 2**53) or a
+    pose alike, so that one search kernel serves every model; a conversion costs about a nanosecond.
+``rollout(state, action, observation, depth, max_depth, discount, data, rng) -> float`` (optional)
+    The return that follows from `state`, counted from now, in place of random actions: a policy simulated to the end in this
+    one call (at most ``max_depth - depth`` steps), or an estimate. `action` and `observation` are the latest. May change `state`.
+``prior(state, action, observation, depth, data, values, counts)`` (optional)
+    Called when a node gets its actions; all values and counts are 0 before. Writes ``values[a]`` (a return) and ``counts[a]``:
+    that many simulations are taken as done (Silver and Veness 2010, section 3.4 "preferred actions"); a count of -1 forbids the
+    action there. Read from `state` only what the agent itself can see, or the hidden state leaks into the plan.
+
+`data` is whatever the functions need: a NamedTuple of arrays and numbers (or a tuple). The search is compiled once per *type*
+of data and cached on disk, so keep dtypes, dimensions and memory order the same from call to call, and let arrays be writable
+and C-contiguous. `rng` is uint64[1] for `tab_marl.planning.random_kernels`. Return ``np.int64`` observations, float rewards, bool terminals.
+
+**Tables** (`table_model`): transition, observation and reward arrays; a compiled model.
+
+**Plain Python** (`PythonModel`): any class with ``step``; some hundred times slower, for small problems and for debugging.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple, Protocol, TypeAlias
+
+import numpy as np
+from numba import cfunc, typeof, types
+from numpy.typing import ArrayLike, NDArray
+
+from tab_marl.planning import table_kernels
+
+_STATE = types.Array(types.float64, 1, "C")
+_COUNTS = types.Array(types.int64, 1, "C")
+_RNG = types.Array(types.uint64, 1, "C")
+_STEP_RESULT = types.Tuple((types.int64, types.float64, types.boolean))
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledModel:
+    """A generative model made of functions that numba compiles; see the module's head for their signatures."""
+
+    step: Callable[..., tuple[int, float, bool]]
+    actions: int
+    """A: actions are 0 .. A-1."""
+    state_size: int
+    """D: numbers in a state."""
+    data: Any = ()
+    """Arrays and numbers handed to every function."""
+    rollout: Callable[..., float] | None = None
+    prior: Callable[..., None] | None = None
+    action_names: tuple[str, ...] = ()
+    """For people; empty means the numbers."""
+
+    def __post_init__(self) -> None:
+        check_actions(self.actions, self.action_names)
+        if self.state_size < 1:
+            raise ValueError(f"state_size is {self.state_size}, must be >= 1")
+
+    def functions(self) -> tuple[Any, Any, Any]:
+        """step, rollout and prior compiled for this type of data (remembered; rollout and prior may be None)."""
+        data = typeof(self.data)
+        step = _compiled(_plain(self.step), _STEP_RESULT(_STATE, types.int64, data, _RNG))
+        rollout = prior = None
+        if self.rollout is not None:
+            rollout = _compiled(
+                _plain(self.rollout),
+                types.float64(_STATE, types.int64, types.int64, types.int64, types.int64, types.float64, data, _RNG),
+            )
+        if self.prior is not None:
+            prior = _compiled(
+                _plain(self.prior),
+                types.void(_STATE, types.int64, types.int64, types.int64, data, _STATE, _COUNTS),
+            )
+        return step, rollout, prior
+
+
+class PythonModel(Protocol):
+    """A generative model in plain Python. Slow: every step is interpreted, some thousand simulations a second at best.
+
+    May also have ``rollout(state, action, observation, depth, max_depth, discount, rng) -> float``,
+    ``prior(state, action, observation, depth) -> (values [A], counts [A])`` and ``action_names``, as in `CompiledModel`.
+    """
+
+    actions: int
+
+    def step(self, state: Any, action: int, rng: np.random.Generator) -> tuple[Any, Hashable, float, bool]:
+        """(next state, observation, reward, terminal). `state` belongs to the belief: return a new one, do not change it."""
+        ...
+
+
+def check_actions(actions: int, names: tuple[str, ...]) -> None:
+    if actions < 1:
+        raise ValueError(f"actions is {actions}, must be >= 1")
+    if names and len(names) != actions:
+        raise ValueError(f"action_names has {len(names)} names for {actions} actions: give one each, or none")
+
+
+def _plain(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The Python function behind a jitted one."""
+    plain: Callable[..., Any] = getattr(function, "py_func", function)
+    return plain
+
+
+@lru_cache(maxsize=512)
+def _compiled(function: Callable[..., Any], signature: Any) -> Any:
+    try:
+        return cfunc(signature, cache=True)(function)
+    except RuntimeError as error:  # a function typed at a prompt has no file beside which to keep a cache
+        if "locator" not in str(error):
+            raise
+        return cfunc(signature)(function)
+
+
+@dataclass(frozen=True, eq=False)
+class Particles:
+    """A belief as a sample of states."""
+
+    states: NDArray[np.float64]
+    """``[P, D]`` for a compiled model (``[P]`` is taken as ``[P, 1]``)."""
+    weights: NDArray[np.float64] | None = None
+    """``[P]``, >= 0, not all zero, of any scale; None: all alike."""
+
+
+Sampler: TypeAlias = Callable[[int, np.random.Generator], ArrayLike]
+"""``sampler(count, rng) -> [count, D]`` states drawn from the belief."""
+
+
+class TableData(NamedTuple):
+    """Tables as the kernel reads them; rows are ``action * S + state``."""
+
+    transition: NDArray[np.float64]
+    """``[A*S, S]`` cumulative."""
+    observation: NDArray[np.float64]
+    """``[A*S, O]`` cumulative, by the state reached."""
+    reward: NDArray[np.float64]
+    """``[A*S, S]`` by state left and state reached."""
+    terminal: NDArray[np.bool_]
+    """``[S]``."""
+
+
+def table_model(
+    transition: ArrayLike,
+    observation: ArrayLike,
+    reward: ArrayLike,
+    terminal: ArrayLike | None = None,
+    action_names: tuple[str, ...] = (),
+) -> CompiledModel:
+    """A POMDP with S states, A actions and O observations as a compiled model whose state is ``[state number]``.
+
+    `transition` ``[A, S, S]``: T(s' | s, a). `observation` ``[A, S, O]``: O(o | a, s'), s' the state reached. `reward`
+    ``[A, S]`` or ``[A, S, S]``: R(s, a) or R(s, a, s'). `terminal` ``[S]``: states that end the process when reached.
+    Raises ValueError when shapes disagree or a row is not a distribution.
+    """
+    t = _distributions("transition", transition, "T(. | state, action)")
+    actions, states = t.shape[:2]
+    if t.shape[2] != states:
+        raise ValueError(f"transition has shape {t.shape}, must be [A, S, S]")
+    o = _distributions("observation", observation, "O(. | action, state reached)")
+    if o.shape[:2] != (actions, states):
+        raise ValueError(f"observation has shape {o.shape}, must be [{actions}, {states}, O] to go with transition")
+    r = np.asarray(reward, dtype=np.float64)
+    if r.shape not in ((actions, states), (actions, states, states)):
+        raise ValueError(
+            f"reward has shape {r.shape}, must be [{actions}, {states}] or [{actions}, {states}, {states}]"
+        )
+    if not np.isfinite(r).all():
+        raise ValueError("reward has entries that are not finite")
+    if r.ndim == 2:
+        r = np.repeat(r[:, :, None], states, axis=2)
+    ends = np.zeros(states, dtype=np.bool_) if terminal is None else np.array(terminal, dtype=np.bool_)
+    if ends.shape != (states,):
+        raise ValueError(f"terminal has shape {ends.shape}, must be [{states}]")
+    data = TableData(
+        _cumulative(t).reshape(actions * states, states),
+        _cumulative(o).reshape(actions * states, o.shape[2]),
+        np.ascontiguousarray(r).reshape(actions * states, states),
+        ends,
+    )
+    return CompiledModel(table_kernels.step, actions, 1, data, action_names=action_names)
+
+
+def _distributions(name: str, table: ArrayLike, meaning: str) -> NDArray[np.float64]:
+    rows = np.asarray(table, dtype=np.float64)
+    if rows.ndim != 3:
+        raise ValueError(f"{name} has {rows.ndim} dimensions, must have 3")
+    bad = (rows < 0).any(axis=2) | ~np.isclose(rows.sum(axis=2), 1.0, rtol=0.0, atol=1e-9)
+    if bad.any():
+        action, state = (int(i) for i in np.argwhere(bad)[0])
+        raise ValueError(
+            f"{name}[{action}, {state}] = {meaning} is not a distribution: "
+            f"least entry {rows[action, state].min():g}, sum {rows[action, state].sum():g}, must be >= 0 and sum to 1"
+        )
+    return rows
+
+
+def _cumulative(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Cumulative sums whose last *possible* entry is exactly 1, so that no draw can land on an impossible one."""
+    total = np.cumsum(rows, axis=2)
+    total[total >= total[:, :, -1:]] = 1.0
+    return np.ascontiguousarray(total)
+
+
+def belief_states(
+    model: CompiledModel, belief: Any, count: int, rng: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    """(states ``[P, D]``, weights ``[P]`` or None) of any kind of belief; a sampler is asked for `count` states."""
+    weights = None
+    if isinstance(belief, Particles):
+        belief, weights = belief.states, belief.weights
+    elif callable(belief):
+        belief = belief(count, rng)
+    states = np.ascontiguousarray(belief, dtype=np.float64)
+    if states.ndim == 1:
+        states = states.reshape(-1, 1)
+    if states.ndim != 2 or states.shape[1] != model.state_size:
+        raise ValueError(
+            f"the belief's states have shape {states.shape}, must be [P, {model.state_size}] for this model"
+        )
+    if len(states) == 0:
+        raise ValueError(
+            "the belief is empty: give at least one state (an updater that lost all particles must refill)"
+        )
+    return states, check_weights(weights, len(states))
+
+
+def check_weights(weights: ArrayLike | None, count: int) -> NDArray[np.float64] | None:
+    if weights is None:
+        return None
+    w = np.asarray(weights, dtype=np.float64)
+    if w.shape != (count,):
+        raise ValueError(f"the belief has weights of shape {w.shape} for {count} states")
+    if not np.isfinite(w).all() or (w < 0).any() or not w.sum() > 0:
+        raise ValueError("the belief's weights must be finite, >= 0 and not all zero")
+    return w
+
+
+def draw_particles(
+    count: int, states: int, weights: NDArray[np.float64] | None, rng: np.random.Generator
+) -> NDArray[np.int64]:
+    """Which particle each of `count` simulations starts from: systematic resampling, then shuffled.
+
+    Each particle is used as often as its weight says, to within one, which is unbiased and steadier than independent draws.
+    """
+    at = (np.arange(count) + rng.random()) / count
+    if weights is None:
+        chosen = np.minimum((at * states).astype(np.int64), states - 1)
+    else:
+        cumulative = np.cumsum(weights)
+        chosen = np.searchsorted(cumulative, at * cumulative[-1], side="right").astype(np.int64)
+        chosen = np.minimum(chosen, int(np.flatnonzero(weights)[-1]))
+    rng.shuffle(chosen)
+    return chosen
+
+
+def action_names(model: Any) -> tuple[str, ...]:
+    """Names of the model's actions, or their numbers."""
+    names = tuple(getattr(model, "action_names", ()))
+    return names or tuple(str(a) for a in range(model.actions))
