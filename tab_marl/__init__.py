@@ -32,7 +32,33 @@ _HOME = {
 }
 _MODULES = ("agents", "envs", "evaluation", "field", "mission", "planning", "world")
 
-__all__ = ["__version__", *_HOME, *_MODULES]  # noqa: PLE0604
+__all__ = [
+    "Constraint",
+    "FieldOptions",
+    "FieldProblem",
+    "GridMap",
+    "Mission",
+    "Pomcp",
+    "PomcpOptions",
+    "Scenario",
+    "TabField",
+    "Task",
+    "__version__",
+    "agents",
+    "envs",
+    "evaluation",
+    "field",
+    "load_zoo",
+    "make_planner",
+    "mission",
+    "parse_mission",
+    "planning",
+    "sample_scenario",
+    "sample_task",
+    "solve",
+    "to_english",
+    "world",
+]
 
 if TYPE_CHECKING:
     from tab_marl import agents, envs, evaluation, field, mission, planning, world
