@@ -11,6 +11,7 @@ from tab_marl.mission.automaton import (
 )
 from tab_marl.mission.compile import compile_mission
 from tab_marl.mission.model import Constraint, ConstraintType, Mission, Place, place_name
+from tab_marl.mission.monitor import Monitor
 from tab_marl.mission.unroll import TickAutomaton, unroll
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "ConstraintType",
     "Mission",
     "MissionAutomaton",
+    "Monitor",
     "Place",
     "TickAutomaton",
     "compile_mission",

@@ -144,7 +144,6 @@ class _Compilation:
         frontier = [_Location(0)]
         while frontier:
             location = frontier.pop()
-            goal = self.goals[location.goal]
             following = {self._after(location, place) for place in self._eligible(location)}
             if location.within >= 0:
                 following.add(_Location(location.goal, visits=location.visits))

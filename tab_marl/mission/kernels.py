@@ -76,8 +76,7 @@ def unroll(
     span = np.ones(3, dtype=np.int64)
     for k in range(3):
         for u in range(caps.shape[0]):
-            if caps[u, k] + 2 > span[k]:
-                span[k] = caps[u, k] + 2
+            span[k] = max(span[k], caps[u, k] + 2)
     location[0] = initial
     clocks[0, :] = -1
     count = 1
@@ -95,8 +94,7 @@ def unroll(
                 continue
             key = np.int64(u)
             for k in range(3):
-                if moving[k] > caps[u, k]:
-                    moving[k] = caps[u, k]
+                moving[k] = min(moving[k], caps[u, k])
                 key = key * span[k] + moving[k]
             slot = _slot(keys, key)
             if keys[slot] == -1:

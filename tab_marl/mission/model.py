@@ -165,9 +165,7 @@ class Mission:
             raise ValueError("Mission.constraints is empty, must hold at least one constraint")
         for number, constraint in enumerate(self.constraints):
             goal = constraint.until_goal
-            if goal is not None and not (
-                0 <= goal < len(self.constraints) and self.constraints[goal].type.is_goal
-            ):
+            if goal is not None and not (0 <= goal < len(self.constraints) and self.constraints[goal].type.is_goal):
                 raise ValueError(
                     f"Mission.constraints[{number}].until_goal is {goal}, must be the index of a goal constraint: "
                     f"one of {list(self.goal_indices)}"

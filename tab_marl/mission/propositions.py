@@ -90,4 +90,4 @@ class Propositions:
         return found
 
     def _bit(self, region: Region) -> NDArray[np.bool_]:
-        return (self.masks >> self.regions.index(region)) & 1 == 1
+        return np.asarray((self.masks >> self.regions.index(region)) & 1 == 1)
