@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from typing import Literal
 
-from numpy.typing import ArrayLike
+import numpy as np
 
+from tab_marl.mission import kernels
 from tab_marl.mission.automaton import (
     BEFORE_START,
     COMPLETED,
@@ -21,11 +23,14 @@ from tab_marl.mission.automaton import (
 from tab_marl.mission.compile import compile_mission
 from tab_marl.mission.model import Constraint, ConstraintType, Mission, Place, place_name
 from tab_marl.mission.propositions import region_of
+from tab_marl.world.regions import BOUNDARY_METRES, Box, Disc, Region
 from tab_marl.world.scenario import Scenario
 
 # A body that is commanded at the limit overshoots a little; this share above the limit is no violation.
 SPEED_TOLERANCE = 0.02
 
+Point = Sequence[float] | np.ndarray[tuple[int], np.dtype[np.float64]]
+"""x, y in metres."""
 Status = Literal["active", "completed", "failed"]
 
 
@@ -48,6 +53,8 @@ class Monitor:
             raise ValueError(
                 f"automaton.tick_seconds is {self.automaton.tick_seconds}, must equal the monitor's {tick_seconds}"
             )
+        self._inside_proposition = [_membership(region) for region in self.automaton.regions]
+        self._clocks = np.array(BEFORE_START, dtype=np.int32)
         self._state = AutomatonState(self.automaton.initial, BEFORE_START)
         self._tick = -1
         self._done = 0
@@ -93,19 +100,20 @@ class Monitor:
         """m/s, inf if none or over."""
         return float(self.automaton.speed_limit[self.location]) if self.location >= 0 else math.inf
 
-    def reset(self, point: ArrayLike) -> Status:
+    def reset(self, point: Point) -> Status:
         """Begin with the robot's centre at `point` (x, y) metres at tick 0."""
+        self._clocks[:] = BEFORE_START
         self._state = AutomatonState(self.automaton.initial, BEFORE_START)
         self._tick, self._done, self._why = -1, 0, ""
         return self._read(point, None)
 
-    def step(self, point: ArrayLike, speed: float | None = None) -> Status:
+    def step(self, point: Point, speed: float | None = None) -> Status:
         """One tick later the robot is at `point`, and drove at `speed` m/s (None: no speed limit is checked)."""
         if self._tick < 0:
             raise RuntimeError("Monitor.step was called before Monitor.reset: reset it with the position at tick 0")
         return self._read(point, speed)
 
-    def _read(self, point: ArrayLike, speed: float | None) -> Status:
+    def _read(self, point: Point, speed: float | None) -> Status:
         if self.location < 0:
             return self.status
         self._tick += 1
@@ -115,8 +123,14 @@ class Monitor:
             self._state = AutomatonState(FAILED, before.clocks)
             self._why = f"drove {speed:.2f} m/s at {self._now}, where at most {limit:g} m/s is allowed"
             return self.status
-        mask = int(self.automaton.masks(point)[0])
-        self._state = self.automaton.advance(before, mask)
+        x, y = point
+        mask = 0
+        for bit, inside in enumerate(self._inside_proposition):
+            if inside(x, y):
+                mask |= 1 << bit
+        location = kernels.advance(*self.automaton.tables, before.location, self._clocks, mask)
+        first, second, third = self._clocks.tolist()
+        self._state = AutomatonState(int(location), (first, second, third))
         if self.location == FAILED:
             self._why = self._explain(before.location, mask, point)
         elif self.location == COMPLETED:
@@ -129,7 +143,7 @@ class Monitor:
     def _now(self) -> str:
         return f"{self._tick * self.tick_seconds:.4g} s"
 
-    def _explain(self, location: int, mask: int, point: ArrayLike) -> str:
+    def _explain(self, location: int, mask: int, point: Point) -> str:
         automaton, clocks = self.automaton, self.clocks
         if clocks[MISSION_CLOCK] < automaton.forbidden_until[location, mask]:
             return self._explain_forbidden(location, point)
@@ -142,10 +156,10 @@ class Monitor:
         inside = [p for p in goal.places if self._inside(p, point)]
         return f"entered {_the(inside[0])} at {self._now}, before its time window opened at {opened:.4g} s"
 
-    def _inside(self, place: Place, point: ArrayLike) -> bool:
+    def _inside(self, place: Place, point: Point) -> bool:
         return bool(region_of(place, self.scenario).contains([point])[0])
 
-    def _explain_forbidden(self, location: int, point: ArrayLike) -> str:
+    def _explain_forbidden(self, location: int, point: Point) -> str:
         goal_index = int(self.automaton.goal[location])
         seconds = self._tick * self.tick_seconds
         avoided: list[Place] = []
@@ -176,6 +190,23 @@ class Monitor:
         visit = f" (visit {int(self.automaton.visits[location]) + 1} of {goal.visits})" if goal.visits > 1 else ""
         since = "goal" if clock == STAGE_CLOCK or goal.visits == 1 else "visit"
         return f"missed {_goal_words(goal)}{visit}: at most {allowed} after the previous {since}"
+
+
+def _membership(region: Region) -> Callable[[float, float], bool]:
+    """`Region.contains` for one point at a time, without the cost of small arrays: an environment asks at every step."""
+    if isinstance(region, Disc):
+        x, y, reach = region.x, region.y, region.radius + BOUNDARY_METRES
+        return lambda px, py: math.hypot(px - x, py - y) <= reach
+    if isinstance(region, Box):
+        left, bottom, right, top = region.bounds()
+
+        def in_box(px: float, py: float) -> bool:
+            if left <= px <= right and bottom <= py <= top:
+                return True
+            return math.hypot(max(left - px, px - right, 0.0), max(bottom - py, py - top, 0.0)) <= BOUNDARY_METRES
+
+        return in_box
+    return lambda px, py: bool(region.contains((px, py)))
 
 
 def _counts_from_start(constraint: Constraint) -> bool:
