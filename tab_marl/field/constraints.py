@@ -1,0 +1,246 @@
+"""Constraints beyond the mission: equal goal marginals, uniform completion tick, completion with probability c.
+
+Each is a set of expectations under P. The minimiser of KL(P || Q) is then Q times a product of weights on transitions of
+the automaton (exponential tilting), and the weights are found by iterative proportional scaling, accelerated after
+Anderson (1965): each round is one backward and one forward pass.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tab_marl.field.problem import FieldProblem
+
+Floats = NDArray[np.float64]
+UNUSED = -1
+UNREACHABLE, PATH_DEPENDENT = -2, -3
+HISTORY = 6
+
+
+def ticks_of(problem: FieldProblem) -> NDArray[np.int64]:
+    """``[Q]``: the tick at which an automaton state is entered (-1: before the first), PATH_DEPENDENT or UNREACHABLE."""
+    automaton = problem.automaton
+    count = len(automaton.delta)
+    lowest = np.full(count, np.iinfo(np.int64).max)
+    highest = np.full(count, UNREACHABLE, dtype=np.int64)
+    occurring = np.unique(np.asarray(problem.labels))
+    lowest[automaton.initial] = highest[automaton.initial] = -1
+    absorbing = {automaton.accepting, automaton.rejecting}
+    for q in np.argsort(automaton.rank, kind="stable"):
+        if q in absorbing or highest[q] == UNREACHABLE:
+            continue
+        following = automaton.delta[q, occurring]
+        np.minimum.at(lowest, following, lowest[q] + 1)
+        np.maximum.at(highest, following, highest[q] + 1)
+    return np.where(highest == UNREACHABLE, UNREACHABLE, np.where(lowest == highest, highest, PATH_DEPENDENT))
+
+
+@dataclass(eq=False)
+class Tilt:
+    """Weights in force, as logarithms, and the features they belong to."""
+
+    problem: FieldProblem
+    branch_groups: list[NDArray[np.int64]]
+    """Branches that can stand for one another."""
+    completion_tick: NDArray[np.int64]
+    """``[Q, L]``: tick of a transition into acceptance, UNUSED elsewhere or when the timing prior is off."""
+    log_branch: Floats
+    """``[B]``."""
+    log_tick: Floats
+    """``[ticks]``; -inf where completion is not feasible."""
+    log_failure: float
+    """Weight of failing, relative to completing; -inf when completion is certain."""
+    ticks: NDArray[np.int64]
+    """Feasible completion ticks."""
+
+    @classmethod
+    def of(cls, problem: FieldProblem) -> Tilt:
+        automaton, options = problem.automaton, problem.options
+        completion = np.full(automaton.delta.shape, UNUSED, dtype=np.int64)
+        if options.timing_prior:
+            entered = ticks_of(problem)
+            completing = automaton.delta == automaton.accepting
+            completing[automaton.accepting] = False
+            if (entered[completing.any(axis=1)] == PATH_DEPENDENT).any():
+                raise ValueError(
+                    "FieldOptions.timing_prior needs a mission whose automaton tells the tick of completion; this "
+                    "one's clocks are relative to earlier visits: set timing_prior=False"
+                )
+            known = np.where(entered >= -1, entered + 1, UNUSED)
+            completion[completing] = np.broadcast_to(known[:, None], completing.shape)[completing]
+        ticks = int(completion.max(initial=-1)) + 1
+        return cls(
+            problem,
+            alternatives(problem) if options.goal_marginals else [],
+            completion,
+            np.zeros(int(automaton.branch.max(initial=-1)) + 1),
+            np.zeros(ticks),
+            -np.inf if options.completion_probability == 1 else 0.0,
+            np.arange(0),
+        )
+
+    @property
+    def needed(self) -> bool:
+        """Whether anything has to be fitted."""
+        return bool(self.branch_groups) or self.completion_tick.max(initial=-1) >= 0 or np.isfinite(self.log_failure)
+
+    def log_weight(self) -> Floats:
+        """``[Q, L]``: log of the factor on each transition."""
+        branch = self.problem.automaton.branch
+        total = np.zeros(branch.shape)
+        if len(self.log_branch):
+            total += np.where(branch >= 0, self.log_branch[np.maximum(branch, 0)], 0.0)
+        if len(self.log_tick):
+            used = self.completion_tick >= 0
+            total[used] += self.log_tick[self.completion_tick[used]]
+        return total
+
+    def visits(self, flux: Floats) -> Floats:
+        """``[B]`` expected visits by branch, from expected transitions ``[Q, L]``."""
+        branch = self.problem.automaton.branch
+        used = branch >= 0
+        return np.bincount(branch[used], flux[used], minlength=len(self.log_branch))
+
+    def completions(self, flux: Floats) -> Floats:
+        """``[ticks]`` probability of completing at each tick (timing prior only)."""
+        used = self.completion_tick >= 0
+        return np.bincount(self.completion_tick[used], flux[used], minlength=len(self.log_tick))
+
+    def completed(self, flux: Floats) -> float:
+        into = self.problem.automaton.delta == self.problem.automaton.accepting
+        return float(flux[into].sum())
+
+    def drop_infeasible(self, flux: Floats) -> None:
+        """Leave out the branches and ticks that the mission-conditioned reference (almost) never takes."""
+        least = self.problem.options.least_share
+        visits = self.visits(flux)
+        groups = []
+        for group in self.branch_groups:
+            usable = group[visits[group] > least * max(visits[group].sum(), 1e-300)]
+            # A place visited on every path has no alternative.
+            usable = usable[np.abs(visits[usable] - 1) > 1e-12] if len(usable) > 1 else usable
+            if len(usable) > 1:
+                groups.append(usable)
+        self.branch_groups = groups
+        if len(self.log_tick):
+            share = self.completions(flux)
+            at = np.arange(len(share))
+            feasible = (share > least * max(share.sum(), 1e-300)) & (at >= self.problem.earliest_tick)
+            if feasible.any():
+                self.ticks = np.flatnonzero(feasible)
+                self.log_tick[:] = np.where(feasible, 0.0, -np.inf)
+            else:
+                self.ticks = at[share > 0]
+
+    def residual(self, flux: Floats) -> Floats:
+        """Log-ratios target / present of every constrained expectation: the scaling step, zero when all are met."""
+        parts = []
+        visits = self.visits(flux)
+        for group in self.branch_groups:
+            present = np.maximum(visits[group], 1e-300)
+            parts.append(np.log(present.mean()) - np.log(present))
+        if len(self.ticks):
+            present = np.maximum(self.completions(flux)[self.ticks], 1e-300)
+            parts.append(np.log(present.mean()) - np.log(present))
+        if np.isfinite(self.log_failure):
+            done = self.completed(flux)
+            wanted = self.problem.options.completion_probability
+            odds = np.log(wanted / (1 - wanted)) - np.log(max(done, 1e-300) / max(1 - done, 1e-300))
+            parts.append(np.array([-odds]))
+        return np.concatenate(parts) if parts else np.empty(0)
+
+    def get(self) -> Floats:
+        """The free logarithmic weights as one vector, in the order of `residual`."""
+        parts = [self.log_branch[group] for group in self.branch_groups]
+        if len(self.ticks):
+            parts.append(self.log_tick[self.ticks])
+        if np.isfinite(self.log_failure):
+            parts.append(np.array([self.log_failure]))
+        return np.concatenate(parts) if parts else np.empty(0)
+
+    def put(self, vector: Floats) -> None:
+        """Set the free logarithmic weights; the mean of each set of alternatives, which has no effect, is removed."""
+        at = 0
+        for group in self.branch_groups:
+            part = vector[at : at + len(group)]
+            self.log_branch[group] = part - part.mean()
+            at += len(group)
+        if len(self.ticks):
+            part = vector[at : at + len(self.ticks)]
+            self.log_tick[self.ticks] = part - part.mean() if not np.isfinite(self.log_failure) else part
+            at += len(self.ticks)
+        if np.isfinite(self.log_failure):
+            self.log_failure = float(vector[at])
+
+
+def alternatives(problem: FieldProblem) -> list[NDArray[np.int64]]:
+    """Sets of branches that some location offers side by side, joined where they overlap."""
+    automaton = problem.automaton
+    occurring = np.unique(np.asarray(problem.labels))
+    parent = np.arange(int(automaton.branch.max(initial=-1)) + 1)
+
+    def root(b: int) -> int:
+        while parent[b] != b:
+            b = int(parent[b])
+        return b
+
+    offered = automaton.branch[:, occurring]
+    for location in np.unique(automaton.location):
+        side_by_side = np.unique(offered[automaton.location == location])
+        side_by_side = side_by_side[side_by_side >= 0]
+        for b in side_by_side[1:]:
+            parent[root(int(b))] = root(int(side_by_side[0]))
+    roots = np.array([root(b) for b in range(len(parent))], dtype=np.int64)
+    groups = [np.flatnonzero(roots == r) for r in np.unique(roots)]
+    return [group for group in groups if len(group) > 1]
+
+
+def fit(tilt: Tilt, pass_both_ways: Callable[[Tilt], Floats]) -> tuple[Floats, float, int]:
+    """Fit the weights in place; ``pass_both_ways(tilt)`` returns the expected transitions ``[Q, L]`` under them.
+
+    Returns the last such table, the largest relative error of a constrained expectation, and the rounds taken.
+    """
+    options = tilt.problem.options
+    flux = pass_both_ways(tilt)
+    before = tilt.log_tick.copy()
+    tilt.drop_infeasible(flux)
+    if not np.array_equal(before, tilt.log_tick):
+        flux = pass_both_ways(tilt)
+    points: list[Floats] = []
+    steps: list[Floats] = []
+    best = (np.inf, tilt.get(), flux)
+    for round_ in range(1, options.max_iterations + 1):
+        step = tilt.residual(flux)
+        error = float(np.abs(np.expm1(np.clip(step, -50, 50))).max(initial=0.0))
+        if error < best[0]:
+            best = (error, tilt.get(), flux)
+        if error <= options.marginal_tolerance or round_ == options.max_iterations:
+            break
+        points.append(tilt.get())
+        steps.append(step)
+        del points[:-HISTORY], steps[:-HISTORY]
+        tilt.put(_anderson(points, steps))
+        flux = pass_both_ways(tilt)
+    if error > best[0]:
+        tilt.put(best[1])
+        flux = pass_both_ways(tilt)
+    return flux, best[0], round_
+
+
+def _anderson(points: list[Floats], steps: list[Floats]) -> Floats:
+    """The next point: the plain step, corrected by the least-squares combination of the latest differences."""
+    plain = points[-1] + steps[-1]
+    if len(points) < 2:
+        return plain
+    moved = np.stack([points[-1] - p for p in points[:-1]], axis=1)
+    changed = np.stack([steps[-1] - s for s in steps[:-1]], axis=1)
+    share = np.linalg.lstsq(changed, steps[-1], rcond=1e-10)[0]
+    correction = (moved + changed) @ share
+    limit = 4 * max(1.0, float(np.abs(steps[-1]).max()))
+    if not np.isfinite(correction).all() or np.abs(correction).max() > limit:
+        return plain
+    return np.asarray(plain - correction)

@@ -1,0 +1,79 @@
+"""Solving a FieldProblem: one backward pass, or a few where weights are to be fitted."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tab_marl.field import kernels
+from tab_marl.field.chain import ProductChain, product_chain
+from tab_marl.field.constraints import Tilt, fit
+from tab_marl.field.problem import FieldProblem
+from tab_marl.field.tab_field import TabField, expected_transitions, start_log_partition
+
+Floats = NDArray[np.float64]
+
+# Rows of single-precision messages are scaled to this maximum, which leaves 66 decades below it.
+PEAK_SINGLE = 1e30
+
+
+class InfeasibleField(ValueError):
+    """No trajectory of the reference process completes the mission from any start."""
+
+
+def solve(problem: FieldProblem) -> TabField:
+    """The maximum-entropy distribution over trajectories that complete the mission (paper, eq. 1).
+
+    Exact on the product of cells and mission automaton (design, section 4). Raises InfeasibleField.
+    """
+    tilt = Tilt.of(problem)
+    chain = message(problem, tilt)
+    flux: Floats | None = None
+    error, rounds = 0.0, 1
+    if tilt.needed:
+        chains = [chain]
+
+        def pass_both_ways(current: Tilt) -> Floats:
+            chains[0] = message(problem, current)
+            return expected_transitions(chains[0], problem.automaton.rank)
+
+        flux, error, rounds = fit(tilt, pass_both_ways)
+        chain = chains[0]
+    return TabField(problem, chain, tilt, flux, error, rounds)
+
+
+def message(problem: FieldProblem, tilt: Tilt) -> ProductChain:
+    """The chain of the backward messages under these weights."""
+    automaton, motion = problem.automaton, problem.reference
+    count, states = len(automaton.delta), motion.states
+    single = problem.options.precision == "single"
+    value = np.empty((count, states), dtype=np.float32 if single else np.float64)
+    log_scale = np.zeros(count)
+    value[automaton.accepting] = 1.0
+    value[automaton.rejecting] = 1.0 if np.isfinite(tilt.log_failure) else 0.0
+    log_scale[automaton.rejecting] = tilt.log_failure
+    weight = np.exp(tilt.log_weight())
+    transient = np.setdiff1d(np.arange(count), [automaton.accepting, automaton.rejecting, automaton.initial])
+    order = transient[np.argsort(-automaton.rank[transient], kind="stable")].astype(np.int32)
+    kernels.backward(
+        order, motion.indptr, motion.indices, motion.data, motion.mix, problem.reference_of, problem.labels,
+        automaton.delta, weight, PEAK_SINGLE if single else 1.0, value, log_scale,
+    )  # fmt: skip
+    # The initial state only reads the first label and is never left by a move; its scale is that of what follows.
+    value[automaton.initial] = 0.0
+    first = automaton.delta[automaton.initial, np.unique(np.asarray(problem.labels)[np.asarray(problem.start) > 0])]
+    log_scale[automaton.initial] = max(log_scale[first].max(), -1e300)
+    grid = problem.grid
+    chain = product_chain(
+        motion, np.asarray(problem.labels), automaton, np.asarray(problem.start), value,
+        centres=None if grid is None else grid.centres, cell_metres=1.0 if grid is None else grid.cell_metres,
+        reference_of=problem.reference_of, weight=weight, log_scale=log_scale, harmonic=True,
+    )  # fmt: skip
+    feasible = np.isfinite(start_log_partition(chain))
+    if not feasible.any():
+        raise InfeasibleField(
+            "no trajectory of the reference process completes the mission from any start cell: "
+            "the bounds are too tight, or the goal cannot be reached"
+        )
+    start = np.where(feasible, chain.start, 0.0)
+    return chain._replace(start=start / start.sum())
