@@ -23,8 +23,8 @@ def clear_line(cell_at, row_a, column_a, row_b, column_b):
     pieces = 2 * max(abs(dr), abs(dc))
     for i in range(1, pieces):
         fraction = i / pieces
-        r = int(math.floor(row_a + fraction * dr + 0.5))
-        c = int(math.floor(column_a + fraction * dc + 0.5))
+        r = math.floor(row_a + fraction * dr + 0.5)
+        c = math.floor(column_a + fraction * dc + 0.5)
         if cell_at[r, c] < 0:
             return False
     return True

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+
 from tab_marl.planning.interception import NEVER, value_routes
 from tab_marl.planning.interception_kernels import first_meeting, meeting_fraction
 from tab_marl.planning.routes import RouteTable

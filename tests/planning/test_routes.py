@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+
 from tab_marl.planning.motion_kernels import clear_line
 from tab_marl.planning.routes import RouteMap, RouteOptions
 from tab_marl.world.grid import free_points
@@ -82,9 +83,11 @@ def test_in_the_open_a_route_is_a_straight_line() -> None:
         cell = rng.integers(open_map.grid.cells)
         assert open_map.aims[w, cell] == open_map.goals[w]
         x, y = open_map.grid.centres[cell]
-        assert open_map.control((x, y, 0.3), int(w)) == pytest.approx(
-            steer(x, y, 0.3, *open_map.waypoints[w], 0.22, 1.82, 0.1)
-        ) or np.hypot(*(open_map.waypoints[w] - (x, y))) < 0.01
+        assert (
+            open_map.control((x, y, 0.3), int(w))
+            == pytest.approx(steer(x, y, 0.3, *open_map.waypoints[w], 0.22, 1.82, 0.1))
+            or np.hypot(*(open_map.waypoints[w] - (x, y))) < 0.01
+        )
 
 
 def test_aims_follow_a_shortest_path() -> None:

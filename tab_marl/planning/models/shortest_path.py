@@ -1,0 +1,241 @@
+"""FP-POMCP's adversary: it takes the shortest path to the mission's objectives at full speed.
+
+The definition is deterministic; what is seen may contradict it. So the belief is a set of hypotheses that all follow
+shortest paths and differ in the start, in a delay, in the pace, and in which of several goals is meant. The textbook
+hypothesis (no delay, full speed, nearest goals) has nearly all the weight until an observation speaks against it.
+Every sighting starts the paths anew from where the adversary was seen.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tab_marl.mission.model import Constraint, Mission
+from tab_marl.planning.models import walk_kernels as kernels
+from tab_marl.planning.models.interface import SampledPaths, TickObservation
+from tab_marl.planning.models.mission_map import MissionMap
+from tab_marl.world.grid import GridMap
+from tab_marl.world.regions import sample_in
+from tab_marl.world.scenario import Scenario
+
+
+@dataclass(frozen=True)
+class ShortestPathOptions:
+    """The hypotheses beside the textbook one, and how observations weigh."""
+
+    doubt: float = 0.05
+    """Prior weight of all hypotheses but the textbook one."""
+    delays_seconds: tuple[float, ...] = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)
+    paces: tuple[float, ...] = (1.0, 0.7)
+    """Shares of full speed."""
+    starts: int = 8
+    """Points of the start region, before the first sighting."""
+    goal_variants: int = 8
+    """At most so many other choices of goals."""
+    sight_metres: float = 0.08
+    """Standard deviation between a hypothesis and a sighting."""
+    least_evidence: float = 0.01
+    """The likelihood of an observation that a hypothesis excludes, relative to one that it explains."""
+    spread_metres: float = 0.03
+    """Sampled paths are shifted by so much, so that no interception hangs on a hair."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.doubt < 1:
+            raise ValueError(f"ShortestPathOptions.doubt is {self.doubt}, must lie strictly between 0 and 1")
+        if not 0 < self.least_evidence < 1:
+            raise ValueError(f"ShortestPathOptions.least_evidence is {self.least_evidence}, must lie in (0, 1)")
+        if 1.0 not in self.paces or 0.0 not in self.delays_seconds:
+            raise ValueError("ShortestPathOptions: paces must hold 1.0 and delays_seconds 0.0, the textbook hypothesis")
+
+
+def goal_choices(mission: Mission, limit: int) -> tuple[Mission, ...]:
+    """The mission, then the missions in which a choice of places is narrowed: to one place, or to all but one.
+
+    The shortest path of such a mission is the shortest one with that goal in mind.
+    """
+    found = [mission]
+    for index, goal in enumerate(mission.constraints):
+        if not goal.type.is_goal or len(goal.places) <= goal.different:
+            continue
+        for place in goal.places:
+            narrowed = _narrow(goal, place)
+            if narrowed is not None and len(found) <= limit:
+                constraints = (*mission.constraints[:index], narrowed, *mission.constraints[index + 1 :])
+                found.append(replace(mission, constraints=constraints))
+    return tuple(found)
+
+
+def _narrow(goal: Constraint, place: object) -> Constraint | None:
+    if goal.different == 1:
+        return replace(goal, places=(place,), including=())
+    if place in goal.including:
+        return None
+    return replace(goal, places=tuple(p for p in goal.places if p != place))
+
+
+@lru_cache(maxsize=64)
+def _maps(scenario: Scenario, mission: Mission, limit: int) -> tuple[MissionMap, ...]:
+    """The maps of `goal_choices` whose goals can be reached at all; the first is the mission's own."""
+    own = MissionMap.build(scenario, mission)
+    maps = [own]
+    for choice in goal_choices(mission, limit)[1:]:
+        other = MissionMap.build(scenario, choice)
+        start = other.grid.cells_of([scenario.adversary_start.centre])
+        if np.isfinite(other.route.distance[other.automaton.initial, start]).all():
+            maps.append(other)
+    return tuple(maps)
+
+
+@dataclass(frozen=True, eq=False)
+class _Hypotheses:
+    """H paths from a base tick on."""
+
+    base_tick: int
+    choice: NDArray[np.int32]
+    """``[H]`` which goals."""
+    prior: NDArray[np.float64]
+    """``[H]`` log."""
+    positions: NDArray[np.float64]
+    """``[H, T + 1, 2]``."""
+    locations: NDArray[np.int32]
+    """``[H, T + 1]``."""
+    clocks: NDArray[np.int32]
+    """``[H, T + 1, 3]``."""
+    completed: NDArray[np.int32]
+    """``[H]`` tick since the base, or -1."""
+
+
+class ShortestPath:
+    """The belief over hypotheses."""
+
+    def __init__(self, scenario: Scenario, mission: Mission, options: ShortestPathOptions | None = None) -> None:
+        self.options = options or ShortestPathOptions()
+        self.scenario = scenario
+        self.maps = _maps(scenario, mission, self.options.goal_variants)
+        self.fallbacks = 0
+        self._tick = 0
+        self._log_weight = np.empty(0)
+        self._paths: _Hypotheses
+
+    def start(self, observation: TickObservation, rng: np.random.Generator) -> None:
+        self.fallbacks, self._tick = 0, 0
+        seen = observation.sighting
+        if seen is None:
+            starts = sample_in(self.scenario.adversary_start, rng, self.options.starts)
+        else:
+            starts = np.array([[seen.x, seen.y]])
+        count = len(self.maps)
+        shares = np.full(count, self.options.doubt / max(1, count - 1))
+        shares[0] = 1.0 if count == 1 else 1.0 - self.options.doubt
+        before = [(m.automaton.initial, np.full(3, -1, dtype=np.int32)) for m in self.maps]
+        self._grow(starts, before, np.log(shares))
+        if seen is None:
+            self._condition(observation)
+
+    def observe(self, observation: TickObservation, rng: np.random.Generator) -> None:
+        self._tick = observation.tick
+        self._condition(observation)
+        seen = observation.sighting
+        if seen is None:
+            return
+        # Which goals, and how far the mission is, by the hypotheses near the sighting; the path itself starts anew.
+        paths, then = self._paths, self._index() - 1
+        shares, before = np.empty(len(self.maps)), []
+        for choice in range(len(self.maps)):
+            members = np.flatnonzero(paths.choice == choice)
+            best = members[np.argmax(self._log_weight[members])]
+            shares[choice] = np.logaddexp.reduce(self._log_weight[members])
+            before.append((int(paths.locations[best, then]), paths.clocks[best, then].copy()))
+        shares -= np.logaddexp.reduce(shares)
+        shares = np.maximum(shares, math.log(self.options.doubt / len(shares)))
+        self._grow(self._point(observation)[None], before, shares)
+
+    def _index(self) -> int:
+        """Column of the hypotheses that is now."""
+        return min(self._tick - self._paths.base_tick, self._paths.positions.shape[1] - 1)
+
+    def _point(self, observation: TickObservation) -> NDArray[np.float64]:
+        seen = observation.sighting
+        assert seen is not None
+        travelled = seen.speed * seen.age_seconds
+        return np.array([seen.x + travelled * math.cos(seen.theta), seen.y + travelled * math.sin(seen.theta)])
+
+    def _grow(
+        self,
+        starts: NDArray[np.float64],
+        before: list[tuple[int, NDArray[np.int32]]],
+        log_shares: NDArray[np.float64],
+    ) -> None:
+        """Follow every hypothesis to the episode's end; `before`: location and clocks by choice, one tick ago."""
+        options, scenario = self.options, self.scenario
+        ticks = max(1, scenario.horizon_ticks - self._tick)
+        kinds = [(d, p) for d in options.delays_seconds for p in options.paces if d == 0.0 or p == 1.0]
+        count = len(self.maps) * len(kinds) * len(starts)
+        choice = np.empty(count, dtype=np.int32)
+        prior = np.empty(count)
+        positions = np.empty((count, ticks + 1, 2))
+        locations = np.empty((count, ticks + 1), dtype=np.int32)
+        clocks = np.empty((count, ticks + 1, 3), dtype=np.int32)
+        completed = np.empty(count, dtype=np.int32)
+        h = 0
+        for c, m in enumerate(self.maps):
+            for delay, pace in kinds:
+                textbook = delay == 0.0 and pace == 1.0
+                share = 1.0 - options.doubt if textbook else options.doubt / (len(kinds) - 1)
+                for x, y in starts:
+                    location, state = before[c][0], before[c][1].copy()
+                    location = kernels.read_label(location, state, m.mask_at(x, y), m.rules)
+                    completed[h] = kernels.follow_way(
+                        x, y, location, state, round(delay / scenario.step_seconds), pace, m.reach_metres, m.rules,
+                        m.ways, m.ground, positions[h], locations[h], clocks[h],
+                    )  # fmt: skip
+                    if location == -1:
+                        completed[h] = 0
+                    choice[h], prior[h] = c, log_shares[c] + math.log(share / len(starts))
+                    h += 1
+        self._paths = _Hypotheses(self._tick, choice, prior, positions, locations, clocks, completed)
+        self._log_weight = prior.copy()
+
+    def _condition(self, observation: TickObservation) -> None:
+        here, least = self._paths.positions[:, self._index()], math.log(self.options.least_evidence)
+        if observation.sighting is not None:
+            squared = ((here - self._point(observation)) ** 2).sum(axis=1)
+            # No floor here: if all are far off, the nearest decide.
+            evidence = -(squared - squared.min()) / (2 * self.options.sight_metres**2)
+            surprise = squared.min() > (4 * self.options.sight_metres) ** 2
+        else:
+            near = np.hypot(*(here - observation.ego).T) <= self.scenario.interception_metres
+            contradicted = self.scenario.seen(here) | near
+            evidence = np.where(contradicted, least, 0.0)
+            surprise = contradicted.all()
+        self.fallbacks += bool(surprise)
+        self._log_weight = self._log_weight + evidence
+        # Forget slowly: a hypothesis written off long ago may come back.
+        floor = self._log_weight.max() + 6 * least
+        self._log_weight = np.maximum(self._log_weight, floor)
+
+    def _weights(self) -> NDArray[np.float64]:
+        weight = np.exp(self._log_weight - self._log_weight.max())
+        return np.asarray(weight / weight.sum())
+
+    def sample(self, count: int, ticks: int, rng: np.random.Generator) -> SampledPaths:
+        paths, now = self._paths, self._index()
+        weight = self._weights()
+        done = (paths.completed >= 0) & (paths.completed <= now)
+        if not done.all():
+            weight = np.where(done, 0.0, weight)
+        chosen = rng.choice(len(weight), size=count, p=weight / weight.sum())
+        columns = np.minimum(now + np.arange(ticks + 1), paths.positions.shape[1] - 1)
+        positions = paths.positions[chosen][:, columns] + rng.normal(0.0, self.options.spread_metres, (count, 1, 2))
+        completed = np.where(paths.completed[chosen] > now, paths.completed[chosen] - now, -1)
+        return SampledPaths(positions, completed.astype(np.int32))
+
+    def occupancy(self) -> tuple[GridMap, NDArray[np.float64]]:
+        grid = self.maps[0].grid
+        cells = grid.cells_of(self._paths.positions[:, self._index()])
+        return grid, np.bincount(cells, weights=self._weights(), minlength=grid.cells)
