@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import ClassVar, Literal
 
+import numpy as np
+
 Place = str | tuple[float, float]
 """The name of a region, or a bare target point: a disc of `Scenario.target_radius_metres` around it."""
 
@@ -191,11 +193,12 @@ def place_name(place: Place) -> str:
     """How people read it: the region's name, or "[1.2, 2.4]"."""
     if isinstance(place, str):
         return place
-    return f"[{_short(place[0])}, {_short(place[1])}]"
+    return f"[{plain_number(place[0])}, {plain_number(place[1])}]"
 
 
-def _short(value: float) -> str:
-    return str(int(value)) if value == int(value) else repr(value)
+def plain_number(value: float) -> str:
+    """The shortest decimal without an exponent that reads back as the same number: "5", "0.25"."""
+    return np.format_float_positional(value, trim="-")
 
 
 def _as_place(place: object, name: str) -> Place:

@@ -157,7 +157,7 @@ class Monitor:
         return f"entered {_the(inside[0])} at {self._now}, before its time window opened at {opened:.4g} s"
 
     def _inside(self, place: Place, point: Point) -> bool:
-        return bool(region_of(place, self.scenario).contains([point])[0])
+        return bool(region_of(place, self.scenario).contains(np.asarray(point)))
 
     def _explain_forbidden(self, location: int, point: Point) -> str:
         goal_index = int(self.automaton.goal[location])
@@ -188,8 +188,9 @@ class Monitor:
             kind = "deadline" if bound.type is ConstraintType.DEADLINE else "time window closed at"
             return f"missed {_goal_words(bound)}: {kind} {allowed}"
         visit = f" (visit {int(self.automaton.visits[location]) + 1} of {goal.visits})" if goal.visits > 1 else ""
-        since = "goal" if clock == STAGE_CLOCK or goal.visits == 1 else "visit"
-        return f"missed {_goal_words(goal)}{visit}: at most {allowed} after the previous {since}"
+        counted = int(self.automaton.visits[location]) > 0 and clock == VISIT_CLOCK
+        since = "the previous visit" if counted else "the previous goal" if self._done else "the start"
+        return f"missed {_goal_words(goal)}{visit}: at most {allowed} after {since}"
 
 
 def _membership(region: Region) -> Callable[[float, float], bool]:
