@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Compiled loops of the world: geodesic distances on a grid and the kinematic unicycle.
 
 Arrays and scalars only; nothing here validates or raises. Each has a slow twin in ``tests/world``.
