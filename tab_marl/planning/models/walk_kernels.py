@@ -156,10 +156,10 @@ def too_early(location, clocks, mask, rules):
     _next, _forbidden, progress, patient, earliest, _latest, _resets = rules
     if not progress[location, mask] or patient[location]:
         return False
+    early = False
     for k in range(3):
-        if clocks[k] + 1 < earliest[location, k]:
-            return True
-    return False
+        early |= clocks[k] + 1 < earliest[location, k]
+    return early
 
 
 @njit(cache=True)

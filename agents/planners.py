@@ -1,0 +1,249 @@
+"""The planners as agents: environment observations in, controls out.
+
+Seven names, one planner: they differ in nothing but the adversary model (`tab_marl.planning.models`).
+
+==================  ====================================================================================================
+name                adversary model
+==================  ====================================================================================================
+S-POMCP             uniform random moves within the speed limit
+FP-POMCP            the shortest path to the mission's objectives at full speed
+MLE-POMCP           moves counted from sightings, kept feasible; keeps learning across episodes
+TAB-POMCP           the TAB-Field's bridge kernel
+oracle              the TAB-Field's, and the adversary is always seen (environment option `full_observation`)
+population-POMCP    trajectories of trained adversaries, weighted by what was seen
+random              none: drives to random waypoints
+==================  ====================================================================================================
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tab_marl.envs.ego_observation import EgoView, parse_ego_observation
+from tab_marl.field.problem import FieldOptions
+from tab_marl.mission.propositions import region_of
+from tab_marl.mission.tasks import Task
+from tab_marl.planning.models.field_model import FieldModel
+from tab_marl.planning.models.interface import AdversaryModel, Sighting, TickObservation
+from tab_marl.planning.models.mission_map import MissionMap
+from tab_marl.planning.models.pool import PoolOptions, TrajectoryPool
+from tab_marl.planning.models.shortest_path import ShortestPath, ShortestPathOptions
+from tab_marl.planning.models.walker import MoveCounts, Walker
+from tab_marl.planning.pursuit import Decision, PursuitOptions, decide
+from tab_marl.planning.routes import RouteMap, RouteOptions
+from tab_marl.world.scenario import UnknownName
+
+PLANNERS = ("S-POMCP", "FP-POMCP", "MLE-POMCP", "TAB-POMCP", "oracle", "population-POMCP", "random")
+
+Rollouts = Callable[[Task, np.random.Generator], tuple[NDArray[np.float64], NDArray[np.int32]]]
+"""Trajectories of a population that nobody hunts: positions ``[N, T + 1, 2]`` per tick, and completion ticks ``[N]``."""
+
+
+@dataclass(frozen=True)
+class PlannerOptions:
+    """How to plan. Nothing in here is a planner's own but its adversary model's options."""
+
+    pursuit: PursuitOptions = field(default_factory=PursuitOptions)
+    routes: RouteOptions = field(default_factory=RouteOptions)
+    tab_field: FieldOptions = field(default_factory=FieldOptions)
+    """Of TAB-POMCP and the oracle."""
+    shortest_path: ShortestPathOptions = field(default_factory=ShortestPathOptions)
+    pool: PoolOptions = field(default_factory=PoolOptions)
+    particles: int = 3000
+    """Of S-POMCP and MLE-POMCP."""
+    rollouts: Rollouts | None = None
+    """Of population-POMCP; None: the zoo that ships with the package."""
+
+    def __post_init__(self) -> None:
+        if self.particles < 1:
+            raise ValueError(f"PlannerOptions.particles is {self.particles}, must be >= 1")
+
+
+class EgoAgent(Protocol):
+    """Whatever can drive the ego."""
+
+    name: str
+    full_observation: bool
+    """Whether the environment must be made with `full_observation`."""
+    decision_seconds: list[float]
+    """Wall-clock time of each decision of this episode, belief update included."""
+
+    def reset(self, task: Task, rng: np.random.Generator) -> None:
+        """Begin an episode."""
+
+    def act(self, observation: ArrayLike) -> NDArray[np.float32]:
+        """The action ``[2]`` in [-1, 1] for one control step."""
+
+    def belief_image(self) -> NDArray[np.float64] | None:
+        """``[rows, columns]``: where the adversary is believed to be, row 0 at the bottom; None if nothing is believed."""
+
+    @property
+    def fallbacks(self) -> int:
+        """How often this episode's observations contradicted the whole belief."""
+
+    def learned_state(self) -> dict[str, Any] | None:
+        """What was learned across episodes, as JSON values; None if nothing ever is."""
+
+    def restore(self, state: Mapping[str, Any] | None) -> None:
+        """The inverse of `learned_state`."""
+
+
+class PlannerAgent:
+    """A planner with an adversary model."""
+
+    def __init__(self, name: str, options: PlannerOptions) -> None:
+        self.name = name
+        self.options = options
+        self.full_observation = name == "oracle"
+        self.decision_seconds: list[float] = []
+        self.decision: Decision | None = None
+        self.moves = MoveCounts() if name == "MLE-POMCP" else None
+        self._model: AdversaryModel | None = None
+
+    def reset(self, task: Task, rng: np.random.Generator) -> None:
+        scenario = task.scenario
+        self.task, self.rng = task, rng
+        self.routes = RouteMap.build(scenario, goal_places(task), self.options.routes)
+        self._model = self._make_model(task, rng)
+        self.decision, self.decision_seconds = None, []
+        self._steps_per_tick = round(scenario.step_seconds * scenario.control_hertz)
+        self._steps_per_decision = scenario.control_hertz // scenario.decision_hertz
+        self._step = 0
+        self._latest: tuple[int, Sighting] | None = None
+
+    def act(self, observation: ArrayLike) -> NDArray[np.float32]:
+        view = parse_ego_observation(observation)
+        if view.adversary is not None:
+            seen = view.adversary
+            self._latest = (self._step, Sighting(seen.x, seen.y, seen.theta, abs(seen.v)))
+        started = time.perf_counter()
+        if self._step % self._steps_per_tick == 0:
+            self._update(view)
+        if self._step % self._steps_per_decision == 0:
+            self._decide(view)
+            self.decision_seconds.append(time.perf_counter() - started)
+        self._step += 1
+        assert self.decision is not None, "call reset before act"
+        return _action(self.routes, (view.x, view.y, view.theta), self.decision.route)
+
+    def belief_image(self) -> NDArray[np.float64] | None:
+        if self._model is None:
+            return None
+        grid, occupancy = self._model.occupancy()
+        return grid.image(occupancy)
+
+    @property
+    def fallbacks(self) -> int:
+        return 0 if self._model is None else self._model.fallbacks
+
+    def learned_state(self) -> dict[str, Any] | None:
+        return None if self.moves is None else self.moves.to_json()
+
+    def restore(self, state: Mapping[str, Any] | None) -> None:
+        if self.moves is not None:
+            self.moves = MoveCounts() if state is None else MoveCounts.from_json(state)
+
+    def _make_model(self, task: Task, rng: np.random.Generator) -> AdversaryModel:
+        scenario, mission, options = task.scenario, task.mission, self.options
+        if self.name == "FP-POMCP":
+            return ShortestPath(scenario, mission, options.shortest_path)
+        if self.name == "S-POMCP":
+            return Walker(MissionMap.build(scenario, mission), particles=options.particles)
+        if self.name == "MLE-POMCP":
+            return Walker(
+                MissionMap.build(scenario, mission), self.moves, feasible=True, learns=True, particles=options.particles
+            )
+        if self.name == "population-POMCP":
+            positions, completed = (options.rollouts or zoo_rollouts)(task, rng)
+            return TrajectoryPool(scenario, positions, completed, options.pool)
+        return FieldModel(scenario, mission, options.tab_field)
+
+    def _update(self, view: EgoView) -> None:
+        """Hand the model what happened since the last tick."""
+        assert self._model is not None, "call reset before act"
+        sighting = None
+        if self._latest is not None:
+            step, seen = self._latest
+            age = (self._step - step) / self.task.scenario.control_hertz
+            sighting = Sighting(seen.x, seen.y, seen.theta, seen.speed, age)
+        tick = self._step // self._steps_per_tick
+        observation = TickObservation(tick, (view.x, view.y), sighting)
+        (self._model.start if tick == 0 else self._model.observe)(observation, self.rng)
+        self._latest = None
+
+    def _decide(self, view: EgoView) -> None:
+        assert self._model is not None
+        scenario, pursuit = self.task.scenario, self.options.pursuit
+        left = scenario.horizon_ticks - self._step // self._steps_per_tick
+        ticks = max(2, min(round(pursuit.horizon_seconds / scenario.step_seconds), left))
+        sampled = self._model.sample(pursuit.paths, ticks, self.rng)
+        current = None if self.decision is None else self.decision.route
+        self.decision = decide(self.routes, (view.x, view.y, view.theta), sampled, current, pursuit, self.rng)
+
+
+class RandomAgent:
+    """Drives to uniformly random waypoints, one after another."""
+
+    name = "random"
+    full_observation = False
+    fallbacks = 0
+
+    def __init__(self, options: PlannerOptions) -> None:
+        self.options = options
+        self.decision_seconds: list[float] = []
+
+    def reset(self, task: Task, rng: np.random.Generator) -> None:
+        self.rng = rng
+        self.routes = RouteMap.build(task.scenario, goal_places(task), self.options.routes)
+        self.decision_seconds = []
+        self._route: int | None = None
+
+    def act(self, observation: ArrayLike) -> NDArray[np.float32]:
+        view = parse_ego_observation(observation)
+        pose = (view.x, view.y, view.theta)
+        if self._route is None or self.routes.control(pose, self._route) == (0.0, 0.0):
+            started = time.perf_counter()
+            self._route = int(self.rng.integers(self.routes.stay))
+            self.decision_seconds.append(time.perf_counter() - started)
+        return _action(self.routes, pose, self._route)
+
+    def belief_image(self) -> NDArray[np.float64] | None:
+        return None
+
+    def learned_state(self) -> dict[str, Any] | None:
+        return None
+
+    def restore(self, state: Mapping[str, Any] | None) -> None:
+        """Nothing is ever learned."""
+
+
+def _action(routes: RouteMap, pose: tuple[float, float, float], route: int) -> NDArray[np.float32]:
+    """The environment's action for the next control step along a route."""
+    v, w = routes.control(pose, route)
+    robot = routes.scenario.ego
+    return np.array([2.0 * v / robot.max_speed - 1.0, w / robot.max_turn_rate], dtype=np.float32)
+
+
+def goal_places(task: Task) -> tuple[tuple[float, float], ...]:
+    """Centres of all places where the mission's goals may be: the ego may want to wait at each."""
+    regions = (region_of(place, task.scenario) for goal in task.mission.goals for place in goal.places)
+    return tuple(dict.fromkeys(region.centre for region in regions))
+
+
+def zoo_rollouts(task: Task, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Trajectories of the zoo's policies in this task, unopposed."""
+    raise NotImplementedError("the zoo is not built yet")
+
+
+def make_planner(name: str, options: PlannerOptions | None = None) -> EgoAgent:
+    """The agent of this name (`PLANNERS`). Raises UnknownName with the nearest one."""
+    if name not in PLANNERS:
+        raise UnknownName("planner", name, PLANNERS)
+    chosen = options or PlannerOptions()
+    return RandomAgent(chosen) if name == "random" else PlannerAgent(name, chosen)

@@ -1,0 +1,88 @@
+"""TAB-POMCP's adversary: the TAB-Field, solved once per mission and filtered exactly on everything seen and not seen."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tab_marl.field.problem import FieldOptions, FieldProblem
+from tab_marl.field.sampling import sample_paths
+from tab_marl.field.solve import solve
+from tab_marl.field.tab_field import TabField
+from tab_marl.mission.model import Mission
+from tab_marl.planning.models.interface import SampledPaths, TickObservation
+from tab_marl.world.grid import GridMap
+from tab_marl.world.scenario import Scenario
+
+ALL_DONE = 1e-3
+"""With less than this chance that the mission is still under way, the hunt is for the reference process."""
+SUBCELLS = 5
+"""Points per side of a cell at which a camera's view is tested."""
+
+
+@lru_cache(maxsize=4)
+def solved_field(scenario: Scenario, mission: Mission, options: FieldOptions) -> TabField:
+    """The field of a task; cached, because all planners of a unit share it."""
+    return solve(FieldProblem.from_mission(mission, scenario, options))
+
+
+@lru_cache(maxsize=32)
+def camera_cover(scenario: Scenario, grid: GridMap) -> NDArray[np.float64]:
+    """``[C]``: the share of each cell that lies in some camera disc."""
+    offsets = ((np.arange(SUBCELLS) + 0.5) / SUBCELLS - 0.5) * grid.cell_metres
+    shift = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 1, 2)
+    return np.asarray(scenario.seen(grid.centres[None] + shift).mean(axis=0))
+
+
+class FieldModel:
+    """The exact belief over cells x modes x mission states under the field's own kernel."""
+
+    def __init__(self, scenario: Scenario, mission: Mission, options: FieldOptions | None = None) -> None:
+        """Raises InfeasibleField when the reference process cannot complete the mission."""
+        self.scenario = scenario
+        self.field = solved_field(scenario, mission, options or FieldOptions())
+        grid = self.field.problem.grid
+        assert grid is not None  # a field made from a mission has one
+        self.grid = grid
+        self._cover = camera_cover(scenario, grid)
+        self.belief = self.field.belief()
+
+    @property
+    def fallbacks(self) -> int:
+        return self.belief.fallbacks
+
+    def start(self, observation: TickObservation, rng: np.random.Generator) -> None:
+        self.belief = self.field.belief()
+        self._condition(observation)
+
+    def observe(self, observation: TickObservation, rng: np.random.Generator) -> None:
+        self.belief.predict()
+        self._condition(observation)
+
+    def sample(self, count: int, ticks: int, rng: np.random.Generator) -> SampledPaths:
+        belief = self.belief
+        under_way = belief.automaton_states != belief.chain.accepting
+        hunting = 1.0 - belief.completed < ALL_DONE
+        if not hunting and not under_way.all():
+            belief = belief.copy()
+            belief.masses = belief.masses[under_way] / belief.masses[under_way].sum()
+            belief.automaton_states = belief.automaton_states[under_way]
+        paths = sample_paths(self.field.chain, belief, rng, count, ticks)
+        completed = np.full(count, -1, dtype=np.int32) if hunting else paths.completed_tick
+        return SampledPaths(paths.positions, completed)
+
+    def occupancy(self) -> tuple[GridMap, NDArray[np.float64]]:
+        return self.grid, self.belief.cell_marginal()
+
+    def _condition(self, observation: TickObservation) -> None:
+        seen, scenario = observation.sighting, self.scenario
+        if seen is None or not observation.seen_now:
+            self.belief.condition_on_unseen(self._cover, observation.ego, scenario.interception_metres)
+        if seen is not None:
+            # Seen within the tick but not at its end: it drove on.
+            travelled = seen.speed * seen.age_seconds
+            point = (seen.x + travelled * math.cos(seen.theta), seen.y + travelled * math.sin(seen.theta))
+            self.belief.condition_on_seen(point, seen.theta, seen.speed / scenario.adversary.max_speed)

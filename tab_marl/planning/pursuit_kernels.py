@@ -1,0 +1,156 @@
+"""The pursuit as a generative model for POMCP: actions are routes of the ego, states are an adversary path and a pose.
+
+Arrays and scalars only; nothing here validates or raises. `data` is the tuple `pursuit.PursuitData`. A state is
+``[path number, tick, x, y, theta]``.
+"""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from tab_marl.planning.interception_kernels import meeting_fraction
+from tab_marl.planning.motion_kernels import drive
+from tab_marl.world.kernels import unicycle_step
+
+UNSEEN = 0
+ENDED = -1
+
+
+@njit(cache=True)
+def sight_code(x, y, cameras, square_metres):
+    """UNSEEN, or a number > 0 for the square of the map in which some camera sees the point."""
+    for i in range(cameras.shape[0]):
+        if math.hypot(x - cameras[i, 0], y - cameras[i, 1]) <= cameras[i, 2]:
+            return 1 + int(y / square_metres) * 4096 + int(x / square_metres)
+    return UNSEEN
+
+
+@njit(cache=True)
+def last_tick(completed, ticks):
+    """The tick at which a path's scenario ends, and whether by completing its mission."""
+    ends = 0 <= completed <= ticks
+    return (completed if ends else ticks), ends
+
+
+@njit(cache=True)
+def drive_tick(x, y, theta, route, geometry, robot):
+    """One tick along a route: (x, y, theta, mean of v^2 + w^2, whether it stands still)."""
+    nearest, cell_metres, centres, aims, goals, waypoints = geometry
+    max_speed, max_turn_rate, seconds, steps = robot
+    if route == waypoints.shape[0]:
+        return x, y, theta, 0.0, True
+    spent, still = 0.0, False
+    for _ in range(int(steps)):
+        v, w = drive(
+            nearest, cell_metres, centres, aims[route], goals[route], waypoints[route, 0], waypoints[route, 1],
+            x, y, theta, max_speed, max_turn_rate, seconds,
+        )  # fmt: skip
+        still = v == 0.0 and w == 0.0
+        if still:
+            break
+        x, y, theta = unicycle_step(x, y, theta, v, w, seconds)
+        spent += (v * v + w * w) / steps
+    return x, y, theta, spent, still
+
+
+@njit(cache=True)
+def pursue(state, route, ticks, data):
+    """Drive a route for so many ticks, or until cameras begin or cease to see the adversary; moves `state` in place.
+
+    Returns (observation, reward, whether the scenario ended).
+    """
+    paths, completed, cameras, geometry, robot, prices, _candidates, _open_loop, _baseline, search = data
+    met, per_tick, per_effort, mission_completed = prices
+    radius, square = search[0], search[1]
+    k, t = int(state[0]), int(state[1])
+    x, y, theta = state[2], state[3], state[4]
+    last, ends = last_tick(completed[k], paths.shape[1] - 1)
+    visible = sight_code(paths[k, t, 0], paths[k, t, 1], cameras, square) != UNSEEN
+    reward, seen, over = 0.0, UNSEEN, t >= last
+    for _ in range(ticks):
+        if over:
+            break
+        to_x, to_y, theta, spent, _still = drive_tick(x, y, theta, route, geometry, robot)
+        s = meeting_fraction(
+            x - paths[k, t, 0], y - paths[k, t, 1], to_x - paths[k, t + 1, 0], to_y - paths[k, t + 1, 1], radius
+        )
+        if s >= 0.0:
+            return ENDED, reward + met + s * (per_tick + per_effort * spent), True
+        x, y, t = to_x, to_y, t + 1
+        reward += per_tick + per_effort * spent
+        over = t >= last
+        seen = sight_code(paths[k, t, 0], paths[k, t, 1], cameras, square)
+        if (seen != UNSEEN) != visible:
+            break
+    state[1], state[2], state[3], state[4] = t, x, y, theta
+    if over:
+        return ENDED, reward + (mission_completed if ends else 0.0), True
+    return seen, reward, False
+
+
+@njit(cache=True)
+def wait_for(state, route, data):
+    """The return of driving a route to its end and waiting there, from a state on."""
+    paths, completed, _cameras, geometry, robot, prices, _candidates, _open_loop, _baseline, search = data
+    met, per_tick, per_effort, mission_completed = prices
+    radius, closing = search[0], search[2]
+    k, t = int(state[0]), int(state[1])
+    x, y, theta = state[2], state[3], state[4]
+    last, ends = last_tick(completed[k], paths.shape[1] - 1)
+    reward = 0.0
+    while t < last:
+        to_x, to_y, theta, spent, still = drive_tick(x, y, theta, route, geometry, robot)
+        s = meeting_fraction(
+            x - paths[k, t, 0], y - paths[k, t, 1], to_x - paths[k, t + 1, 0], to_y - paths[k, t + 1, 1], radius
+        )
+        if s >= 0.0:
+            return reward + met + s * (per_tick + per_effort * spent)
+        x, y, t = to_x, to_y, t + 1
+        reward += per_tick + per_effort * spent
+        if still:
+            break
+    while t < last:
+        ax, ay = x - paths[k, t, 0], y - paths[k, t, 1]
+        gap = math.hypot(ax, ay) - radius
+        if gap > closing:
+            skip = min(int(gap / closing), last - t)
+            reward += skip * per_tick
+            t += skip
+            continue
+        s = meeting_fraction(ax, ay, x - paths[k, t + 1, 0], y - paths[k, t + 1, 1], radius)
+        if s >= 0.0:
+            return reward + met + s * per_tick
+        reward += per_tick
+        t += 1
+    return reward + (mission_completed if ends else 0.0)
+
+
+def step(state, action, data, _rng):
+    """POMCP's generative step: one macro-action.
+
+    The first one of a simulation is paid ``baseline[a] - open_loop[a, path]`` on top: a control variate, by which a
+    simulation that never changes its route returns exactly the route's mean over all paths, and the search only
+    measures what changing routes later is worth.
+    """
+    _paths, _completed, _cameras, _geometry, _robot, _prices, candidates, open_loop, baseline, search = data
+    extra = 0.0
+    if state[1] == 0.0:
+        extra = baseline[action] - open_loop[action, int(state[0])]
+    observation, reward, over = pursue(state, candidates[action], int(search[3]), data)
+    return observation, reward + extra, over
+
+
+def rollout(state, action, _observation, _depth, _max_depth, _discount, data, _rng):
+    """The leaf: go on along the last route and wait at its end."""
+    return wait_for(state, data[6][action], data)
+
+
+def prior(state, action, _observation, _depth, data, values, counts):
+    """At a node below the root: what the routes were worth from the start, less the ticks gone by; keeping on counts more."""
+    baseline, search, per_tick = data[8], data[9], data[5][1]
+    for a in range(values.shape[0]):
+        values[a] = baseline[a] - per_tick * state[1]
+        counts[a] = int(search[4])
+    counts[action] = int(search[5])
