@@ -1,0 +1,154 @@
+"""Plots of the report as SVG text. Colours are CSS classes, so that one picture serves light and dark."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tab_marl.evaluation.statistics import Interval
+
+WIDTH = 300
+LABELS = 82
+"""Width kept for the planners' names."""
+ROW = 21
+FOOT = 34
+TOP = 8
+RIGHT = 14
+
+
+def css_name(planner: str) -> str:
+    """Class of a planner's marks."""
+    return "p-" + planner.casefold().replace("-pomcp", "")
+
+
+@dataclass(frozen=True)
+class Dot:
+    """One row of an interval plot."""
+
+    planner: str
+    interval: Interval
+    paper: float | None = None
+    """The paper's figure, drawn as a hollow diamond."""
+
+
+def interval_plot(dots: Sequence[Dot], maximum: float, unit: str, title: str, scale: float = 1.0) -> str:
+    """Dots with 95 % intervals, one row per planner. `scale` turns the interval's numbers into the axis' ones."""
+    height = TOP + ROW * len(dots) + FOOT
+    span = WIDTH - LABELS - RIGHT
+
+    def x(value: float) -> float:
+        return LABELS + span * min(max(value / maximum, 0.0), 1.0)
+
+    parts = [_open(WIDTH, height, title)]
+    bottom = TOP + ROW * len(dots)
+    for tick in ticks(maximum):
+        parts.append(
+            f'<line class="grid" x1="{x(tick):.1f}" x2="{x(tick):.1f}" y1="{TOP}" y2="{bottom}"/>'
+            f'<text class="tick" x="{x(tick):.1f}" y="{bottom + 14}" text-anchor="middle">{tick:g}</text>'
+        )
+    parts.append(f'<text class="axis" x="{LABELS + span / 2:.0f}" y="{height - 4}" text-anchor="middle">{unit}</text>')
+    for i, dot in enumerate(dots):
+        y = TOP + ROW * (i + 0.5)
+        low, value, high = (scale * v for v in (dot.interval.low, dot.interval.value, dot.interval.high))
+        note = f"{dot.planner}: {value:.1f} (95 % {low:.1f} to {high:.1f}), n = {dot.interval.count}"
+        if dot.paper is not None:
+            note += f"; paper {dot.paper:g}"
+        parts.append(
+            f'<g class="{css_name(dot.planner)}"><title>{escape(note)}</title>'
+            f'<rect class="hit" x="0" y="{y - ROW / 2:.1f}" width="{WIDTH}" height="{ROW}"/>'
+            f'<text class="name" x="{LABELS - 8}" y="{y + 4:.1f}" text-anchor="end">{escape(_short(dot.planner))}</text>'
+            f'<line class="whisker" x1="{x(low):.1f}" x2="{max(x(high), x(low) + 0.5):.1f}" y1="{y:.1f}" y2="{y:.1f}"/>'
+            f"{mark(dot.planner, x(value), y)}"
+        )
+        if dot.paper is not None:
+            px = x(dot.paper)
+            parts.append(f'<path class="paper" d="M{px - 4.5:.1f} {y:.1f}l4.5 -4.5 4.5 4.5 -4.5 4.5z"/>')
+        parts.append("</g>")
+    return "".join(parts) + "</svg>"
+
+
+def mark(planner: str, x: float, y: float, size: float = 4.5) -> str:
+    """Each planner has a shape beside its colour: filled for the paper's four, hollow for the reference rows."""
+    s = size
+    shapes = {
+        "S-POMCP": f'<rect class="mark" x="{x - s:.1f}" y="{y - s:.1f}" width="{2 * s}" height="{2 * s}"/>',
+        "FP-POMCP": f'<path class="mark" d="M{x - s - 1:.1f} {y + s:.1f}h{2 * s + 2}l{-s - 1} {-2 * s - 1}z"/>',
+        "MLE-POMCP": f'<path class="mark" d="M{x - s - 1:.1f} {y - s:.1f}h{2 * s + 2}l{-s - 1} {2 * s + 1}z"/>',
+        "TAB-POMCP": f'<circle class="mark" cx="{x:.1f}" cy="{y:.1f}" r="{s + 1}"/>',
+        "oracle": f'<circle class="mark hollow" cx="{x:.1f}" cy="{y:.1f}" r="{s}"/>',
+        "population-POMCP": f'<rect class="mark hollow" x="{x - s:.1f}" y="{y - s:.1f}" width="{2 * s}" height="{2 * s}"/>',
+    }
+    cross = f'<path class="mark cross" d="M{x - s:.1f} {y - s:.1f}l{2 * s} {2 * s}m0 {-2 * s}l{-2 * s} {2 * s}"/>'
+    return shapes.get(planner, cross)
+
+
+def legend_mark(planner: str) -> str:
+    """The mark alone, for legends."""
+    return (
+        f'<svg class="key {css_name(planner)}" viewBox="0 0 16 16" width="16" height="16" aria-hidden="true">'
+        f"{mark(planner, 8, 8)}</svg>"
+    )
+
+
+def curve_plot(curves: Mapping[str, NDArray[np.float64]], title: str) -> str:
+    """Cumulative shares ``[N]`` over N even steps of the episode, one line per planner, named at its end."""
+    width, height, left, top, foot = 430, 250, 34, 10, 34
+    right = 96
+    w, h = width - left - right, height - top - foot
+    parts = [_open(width, height, title)]
+    for share in (0.0, 0.25, 0.5, 0.75, 1.0):
+        y = top + h * (1 - share)
+        parts.append(
+            f'<line class="grid" x1="{left}" x2="{left + w}" y1="{y:.1f}" y2="{y:.1f}"/>'
+            f'<text class="tick" x="{left - 5}" y="{y + 4:.1f}" text-anchor="end">{100 * share:.0f}</text>'
+        )
+        parts.append(
+            f'<text class="tick" x="{left + w * share:.1f}" y="{top + h + 15}" text-anchor="middle">{100 * share:.0f}</text>'
+        )
+    parts.append(
+        f'<text class="axis" x="{left + w / 2:.0f}" y="{height - 4}" text-anchor="middle">% of the episode’s time</text>'
+    )
+    ends = spread_labels({p: top + h * (1 - float(c[-1])) for p, c in curves.items()}, 13, top + 4, top + h)
+    for planner, curve in curves.items():
+        x = left + w * np.linspace(0, 1, len(curve))
+        y = top + h * (1 - curve)
+        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
+        parts.append(
+            f'<g class="{css_name(planner)}"><title>{escape(planner)}: {100 * curve[-1]:.1f} % at the end</title>'
+            f'<polyline class="curve" points="{points}"/>'
+            f'<path class="leader" d="M{left + w} {y[-1]:.1f}L{left + w + 10} {ends[planner]:.1f}"/>'
+            f'<text class="name" x="{left + w + 13}" y="{ends[planner] + 4:.1f}">{escape(_short(planner))}</text></g>'
+        )
+    return "".join(parts) + "</svg>"
+
+
+def spread_labels(wanted: Mapping[str, float], gap: float, low: float, high: float) -> dict[str, float]:
+    """Heights at least `gap` apart, within [low, high] as far as there is room, in the order and near those wanted."""
+    names = sorted(wanted, key=lambda n: wanted[n])
+    placed: list[float] = []
+    for name in names:
+        placed.append(max(wanted[name], low if not placed else placed[-1] + gap))
+    for i in range(len(placed) - 1, -1, -1):
+        ceiling = high if i == len(placed) - 1 else placed[i + 1] - gap
+        placed[i] = min(placed[i], ceiling)
+    return dict(zip(names, placed, strict=True))
+
+
+def ticks(maximum: float) -> list[float]:
+    """About five round values from 0 to the maximum."""
+    raw = maximum / 4
+    magnitude = 10.0 ** np.floor(np.log10(raw))
+    step = min((m * magnitude for m in (1, 2, 2.5, 5, 10)), key=lambda s: abs(s - raw))
+    return [float(v) for v in np.arange(0, maximum + step * 1e-6, step)]
+
+
+def _short(planner: str) -> str:
+    return planner.removesuffix("-POMCP")
+
+
+def _open(width: int, height: int, title: str) -> str:
+    return f'<svg class="chart" viewBox="0 0 {width} {height}" role="img" aria-label="{escape(title)}">'

@@ -1,0 +1,211 @@
+(() => {
+  "use strict";
+  const root = document.documentElement;
+  const theme = document.getElementById("theme");
+  const isDark = () => root.dataset.theme ? root.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
+  const nameTheme = () => { theme.textContent = isDark() ? "Light" : "Dark"; };
+  nameTheme();
+
+  const source = document.getElementById("replays");
+  const groups = source ? JSON.parse(source.textContent) : [];
+  const repaint = () => { palette = readPalette(); nameTheme(); draw(); };
+  theme.addEventListener("click", () => { root.dataset.theme = isDark() ? "light" : "dark"; repaint(); });
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", repaint);
+
+  function readPalette() {
+    const style = getComputedStyle(root), found = {};
+    for (const name of ["ego", "adversary", "heat", "goal", "camera", "solid", "floor", "ink", "soft", "line", "warn"]) found[name] = style.getPropertyValue("--" + name).trim();
+    return found;
+  }
+  let palette = readPalette(), group = 0, time = 0, playing = false, speed = 4, last = 0, showBelief = true;
+  const stage = document.getElementById("stage");
+  const scrub = document.getElementById("scrub"), clock = document.getElementById("clock"), play = document.getElementById("play");
+  let panels = [];
+
+  function unpack(text, cells) {
+    const raw = atob(text), out = new Uint8Array(cells);
+    let at = 0;
+    for (let i = 0; i < raw.length; i++) {
+      const byte = raw.charCodeAt(i), run = (byte & 15) + 1;
+      out.fill(byte >> 4, at, at + run);
+      at += run;
+    }
+    return out;
+  }
+  const duration = () => Math.max(...groups[group].episodes.map(e => (e.trace.poses[0].length - 1) / e.trace.hertz));
+
+  function choose(index) {
+    group = index;
+    const chosen = groups[group];
+    document.querySelectorAll("#groups button").forEach((b, i) => { b.setAttribute("aria-selected", i === index); b.tabIndex = i === index ? 0 : -1; });
+    document.getElementById("about").textContent = chosen.about;
+    document.getElementById("why").textContent = chosen.why;
+    stage.replaceChildren();
+    panels = chosen.episodes.map(episode => {
+      const figure = document.createElement("figure"), canvas = document.createElement("canvas"), caption = document.createElement("figcaption");
+      canvas.setAttribute("role", "img");
+      canvas.setAttribute("aria-label", episode.planner + ": " + episode.outcome);
+      const name = document.createElement("strong"), state = document.createElement("span");
+      name.textContent = episode.planner;
+      state.className = "state";
+      caption.append(name, state);
+      figure.append(canvas, caption);
+      stage.append(figure);
+      return { episode, canvas, state, frames: new Map() };
+    });
+    scrub.max = Math.round(duration() * 10);
+    seek(duration() * 0.35);
+  }
+
+  function seek(seconds) {
+    time = Math.min(Math.max(seconds, 0), duration());
+    scrub.value = Math.round(time * 10);
+    clock.textContent = time.toFixed(1) + " s";
+    scrub.setAttribute("aria-valuetext", time.toFixed(1) + " seconds");
+    draw();
+  }
+
+  function setPlaying(on) {
+    playing = on;
+    play.textContent = on ? "Pause" : "Play";
+    if (on) {
+      if (time >= duration()) seek(0);
+      last = performance.now();
+      requestAnimationFrame(advance);
+    }
+  }
+  function advance(now) {
+    if (!playing) return;
+    seek(time + (now - last) / 1000 * speed);
+    last = now;
+    if (time >= duration()) setPlaying(false); else requestAnimationFrame(advance);
+  }
+
+  function trace(ctx, region) {
+    ctx.beginPath();
+    if (region[0] === "disc") ctx.arc(region[1], region[2], region[3], 0, 7);
+    else if (region[0] === "box") ctx.rect(region[1], region[2], region[3] - region[1], region[4] - region[2]);
+    else region[1].forEach(([x, y], i) => i ? ctx.lineTo(x, y) : ctx.moveTo(x, y));
+    ctx.closePath();
+  }
+
+  function beliefPicture(panel, index) {
+    const t = panel.episode.trace, key = index + isDark();
+    if (!panel.frames.has(key)) {
+      const rows = t.beliefRows, columns = t.beliefColumns, levels = unpack(t.beliefs[index][1], rows * columns);
+      const picture = document.createElement("canvas");
+      picture.width = columns; picture.height = rows;
+      const ctx = picture.getContext("2d"), image = ctx.createImageData(columns, rows);
+      const colour = parseInt(palette.heat.slice(1), 16);
+      for (let r = 0; r < rows; r++) for (let c = 0; c < columns; c++) {
+        const at = 4 * ((rows - 1 - r) * columns + c);
+        image.data[at] = colour >> 16; image.data[at + 1] = colour >> 8 & 255; image.data[at + 2] = colour & 255;
+        image.data[at + 3] = levels[r * columns + c] * 14;
+      }
+      ctx.putImageData(image, 0, 0);
+      panel.frames.set(key, picture);
+    }
+    return panel.frames.get(key);
+  }
+
+  function draw() {
+    if (!groups.length) return;
+    const map = groups[group].map;
+    for (const panel of panels) {
+      const { episode, canvas, state } = panel, t = episode.trace;
+      const width = canvas.clientWidth || 240, ratio = window.devicePixelRatio || 1, scale = width / map.width;
+      const pixelWidth = Math.round(width * ratio), pixelHeight = Math.round(map.height * scale * ratio);
+      if (canvas.width !== pixelWidth || canvas.height !== pixelHeight) { canvas.width = pixelWidth; canvas.height = pixelHeight; }
+      const ctx = canvas.getContext("2d"), line = 1 / scale;
+      const end = t.poses[0].length - 1, exact = Math.min(time * t.hertz, end), step = Math.floor(exact);
+      ctx.setTransform(1, 0, 0, 1, 0, 0);
+      ctx.fillStyle = palette.floor;
+      ctx.fillRect(0, 0, canvas.width, canvas.height);
+      ctx.setTransform(scale * ratio, 0, 0, -scale * ratio, 0, canvas.height);
+      if (showBelief && t.beliefs.length) {
+        let index = 0;
+        while (index + 1 < t.beliefs.length && t.beliefs[index + 1][0] <= step) index++;
+        ctx.save();
+        ctx.scale(1, -1);
+        ctx.imageSmoothingEnabled = true;
+        ctx.drawImage(beliefPicture(panel, index), 0, -map.height, map.width, map.height);
+        ctx.restore();
+      }
+      ctx.lineWidth = 1.4 * line;
+      for (const zone of map.forbidden) {
+        trace(ctx, zone);
+        ctx.strokeStyle = palette.warn; ctx.setLineDash([4 * line, 4 * line]); ctx.stroke(); ctx.setLineDash([]);
+      }
+      for (const c of map.checkpoints) {
+        ctx.beginPath(); ctx.arc(c.x, c.y, c.camera, 0, 7);
+        ctx.globalAlpha = .1; ctx.fillStyle = palette.camera; ctx.fill();
+        ctx.globalAlpha = .55; ctx.setLineDash([2 * line, 3 * line]); ctx.strokeStyle = palette.camera; ctx.stroke(); ctx.setLineDash([]); ctx.globalAlpha = 1;
+        ctx.beginPath(); ctx.arc(c.x, c.y, c.r, 0, 7); ctx.strokeStyle = palette.soft; ctx.stroke();
+        ctx.save(); ctx.scale(1, -1);
+        ctx.fillStyle = palette.soft; ctx.font = `600 ${13 * line}px system-ui, sans-serif`; ctx.textAlign = "center"; ctx.textBaseline = "middle";
+        ctx.fillText(c.label, c.x, -c.y); ctx.restore();
+      }
+      for (const goal of map.goals) { trace(ctx, goal); ctx.strokeStyle = palette.goal; ctx.lineWidth = 3 * line; ctx.stroke(); }
+      for (const o of map.obstacles) { trace(ctx, o); ctx.fillStyle = palette.solid; ctx.fill(); }
+      const fraction = exact - step, next = Math.min(step + 1, end);
+      for (const [offset, colour, radius] of [[3, palette.adversary, map.radii[1]], [0, palette.ego, map.radii[0]]]) {
+        const xs = t.poses[offset], ys = t.poses[offset + 1], turns = t.poses[offset + 2];
+        const x = (xs[step] + (xs[next] - xs[step]) * fraction) / 1000, y = (ys[step] + (ys[next] - ys[step]) * fraction) / 1000;
+        ctx.beginPath();
+        for (let i = 0; i <= step; i++) ctx.lineTo(xs[i] / 1000, ys[i] / 1000);
+        ctx.lineTo(x, y);
+        ctx.strokeStyle = colour; ctx.lineWidth = 2 * line; ctx.globalAlpha = .75; ctx.lineJoin = "round"; ctx.stroke(); ctx.globalAlpha = 1;
+        if (offset === 0) {
+          ctx.beginPath(); ctx.arc(x, y, map.meet, 0, 7);
+          ctx.setLineDash([3 * line, 3 * line]); ctx.lineWidth = line; ctx.stroke(); ctx.setLineDash([]);
+        }
+        ctx.beginPath(); ctx.arc(x, y, radius, 0, 7);
+        const hidden = offset === 3 && t.seen[step] === "0";
+        ctx.fillStyle = hidden ? palette.floor : colour; ctx.fill();
+        ctx.lineWidth = 2 * line; ctx.strokeStyle = colour; ctx.stroke();
+        ctx.beginPath(); ctx.moveTo(x, y); ctx.lineTo(x + radius * Math.cos(turns[step] / 100), y + radius * Math.sin(turns[step] / 100));
+        ctx.strokeStyle = hidden ? colour : palette.floor; ctx.stroke();
+      }
+      let text = t.seen[step] === "1" ? "a camera sees the adversary" : "the adversary is out of sight", kind = "";
+      for (const [seconds, what] of t.events) if (seconds <= time + 1e-6 && what !== "seen") { text = what + " at " + seconds.toFixed(1) + " s"; kind = what === "intercepted" ? " met" : what === "mission completed" ? " lost" : ""; }
+      if (episode.note && exact >= end) text += ", " + episode.note;
+      state.textContent = text;
+      state.className = "state" + kind;
+    }
+  }
+
+  if (!groups.length) return;
+  const tabs = document.getElementById("groups");
+  groups.forEach((g, i) => {
+    const button = document.createElement("button");
+    button.textContent = g.title; button.setAttribute("role", "tab");
+    button.addEventListener("click", () => { setPlaying(false); choose(i); });
+    tabs.append(button);
+  });
+  tabs.addEventListener("keydown", event => {
+    const move = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+    if (!move) return;
+    const index = (group + move + groups.length) % groups.length;
+    setPlaying(false); choose(index); tabs.children[index].focus(); event.preventDefault(); event.stopPropagation();
+  });
+  play.addEventListener("click", () => setPlaying(!playing));
+  document.getElementById("restart").addEventListener("click", () => seek(0));
+  scrub.addEventListener("input", () => { setPlaying(false); seek(scrub.value / 10); });
+  document.getElementById("speed").addEventListener("change", event => { speed = Number(event.target.value); });
+  const belief = document.getElementById("belief");
+  belief.addEventListener("click", () => { showBelief = !showBelief; belief.setAttribute("aria-pressed", showBelief); draw(); });
+  document.getElementById("replay-card").addEventListener("keydown", event => {
+    if (event.target.closest("select, #groups") || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.key === " " && event.target.tagName !== "BUTTON") setPlaying(!playing);
+    else if (event.target === scrub) return;
+    else if (event.key === "ArrowRight") { setPlaying(false); seek(time + .5); }
+    else if (event.key === "ArrowLeft") { setPlaying(false); seek(time - .5); }
+    else return;
+    event.preventDefault();
+  });
+  window.addEventListener("resize", draw);
+  window.addEventListener("beforeprint", draw);
+  const at = location.hash.match(/^#replay=(\d+)(?:,([\d.]+))?$/);
+  choose(at ? Math.min(Number(at[1]), groups.length - 1) : 0);
+  if (at && at[2]) seek(Number(at[2]));
+})();
