@@ -158,7 +158,8 @@ def product_chain(
     if abs(first.sum() - 1) > 1e-9:
         raise ValueError(f"start sums to {first.sum():.12g}, must sum to 1")
     places = np.asarray(
-        np.stack([np.arange(cells) + 0.5, np.full(cells, 0.5)], axis=1) if centres is None else centres, dtype=np.float64
+        np.stack([np.arange(cells) + 0.5, np.full(cells, 0.5)], axis=1) if centres is None else centres,
+        dtype=np.float64,
     )
     if places.shape != (cells, 2):
         raise ValueError(f"centres has shape {places.shape}, must be [{cells}, 2]")

@@ -56,6 +56,8 @@ class Tilt:
     """Weight of failing, relative to completing; -inf when completion is certain."""
     ticks: NDArray[np.int64]
     """Feasible completion ticks."""
+    tick_shares: Floats
+    """Their wanted shares, sum 1."""
 
     @classmethod
     def of(cls, problem: FieldProblem) -> Tilt:
@@ -81,6 +83,7 @@ class Tilt:
             np.zeros(ticks),
             -np.inf if options.completion_probability == 1 else 0.0,
             np.arange(0),
+            np.empty(0),
         )
 
     @property
@@ -128,13 +131,20 @@ class Tilt:
         self.branch_groups = groups
         if len(self.log_tick):
             share = self.completions(flux)
-            at = np.arange(len(share))
-            feasible = (share > least * max(share.sum(), 1e-300)) & (at >= self.problem.earliest_tick)
-            if feasible.any():
-                self.ticks = np.flatnonzero(feasible)
-                self.log_tick[:] = np.where(feasible, 0.0, -np.inf)
-            else:
-                self.ticks = at[share > 0]
+            target = self._uniform_ticks(share > least * max(share.sum(), 1e-300))
+            self.ticks = np.flatnonzero(target > 0)
+            self.tick_shares = target[self.ticks]
+            self.log_tick[:] = np.where(target > 0, 0.0, -np.inf)
+
+    def _uniform_ticks(self, possible: NDArray[np.bool_]) -> Floats:
+        """``[ticks]``: uniform over each start cell's feasible ticks, averaged over the start."""
+        at = np.arange(len(possible))
+        start = np.asarray(self.problem.start)
+        used = np.flatnonzero(start)
+        earliest = np.broadcast_to(np.asarray(self.problem.earliest_tick), start.shape)[used]
+        feasible = possible & (at >= earliest[:, None])
+        feasible[~feasible.any(axis=1)] = possible
+        return np.asarray(start[used] @ (feasible / feasible.sum(axis=1, keepdims=True)))
 
     def residual(self, flux: Floats) -> Floats:
         """Log-ratios target / present of every constrained expectation: the scaling step, zero when all are met."""
@@ -145,7 +155,7 @@ class Tilt:
             parts.append(np.log(present.mean()) - np.log(present))
         if len(self.ticks):
             present = np.maximum(self.completions(flux)[self.ticks], 1e-300)
-            parts.append(np.log(present.mean()) - np.log(present))
+            parts.append(np.log(present.sum() * self.tick_shares) - np.log(present))
         if np.isfinite(self.log_failure):
             done = self.completed(flux)
             wanted = self.problem.options.completion_probability

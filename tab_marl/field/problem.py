@@ -72,7 +72,9 @@ class FieldOptions:
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise ValueError(f"FieldOptions.{name} is {value}, must be > 0")
         if not 0 < self.completion_probability <= 1:
-            raise ValueError(f"FieldOptions.completion_probability is {self.completion_probability}, must lie in (0, 1]")
+            raise ValueError(
+                f"FieldOptions.completion_probability is {self.completion_probability}, must lie in (0, 1]"
+            )
         if self.headings < 4:
             raise ValueError(f"FieldOptions.headings is {self.headings}, must be >= 4")
         if self.max_iterations < 1:
@@ -110,8 +112,8 @@ class FieldProblem:
     scenario: Scenario | None = None
     branch_places: tuple[str, ...] = ()
     """Names of the automaton's branches, for people."""
-    earliest_tick: int = 0
-    """No completion before this tick counts as feasible for the timing prior."""
+    earliest_tick: ArrayLike = 0
+    """``[C]`` or one number: no completion before this tick, from this start cell, is feasible for the timing prior."""
 
     def __post_init__(self) -> None:
         motion = self.transitions if isinstance(self.transitions, Reference) else from_matrices(self.transitions)
@@ -229,18 +231,17 @@ def start_cells(grid: GridMap, scenario: Scenario) -> NDArray[np.float64]:
     return np.asarray(inside / inside.sum())
 
 
-def _earliest_tick(compiled: MissionAutomaton, grid: GridMap, scenario: Scenario) -> int:
-    """The first tick at which the shortest path at full speed completes the mission, from the best start cell."""
+def _earliest_tick(compiled: MissionAutomaton, grid: GridMap, scenario: Scenario) -> NDArray[np.int64]:
+    """``[C]``: the first tick at which the shortest path at full speed from each start cell completes the mission."""
     from tab_marl.mission.route import solve_route
 
     inside = np.flatnonzero(start_cells(grid, scenario))
-    masks = compiled.masks(grid.centres[inside])
     route = solve_route(compiled, grid)
-    metres = math.inf
-    for cell, mask in zip(inside, masks, strict=True):
+    earliest = np.zeros(grid.cells, dtype=np.int64)
+    for cell, mask in zip(inside, compiled.masks(grid.centres[inside]), strict=True):
         location = compiled.first(int(mask)).location
-        if location >= 0:
-            metres = min(metres, float(route.length[location, cell]))
-    if not math.isfinite(metres):
-        return 0
-    return max(0, math.ceil(metres / (scenario.adversary.max_speed * scenario.step_seconds) - 1e-9))
+        metres = float(route.length[location, cell]) if location >= 0 else 0.0
+        if math.isfinite(metres):
+            ticks = metres / (scenario.adversary.max_speed * scenario.step_seconds)
+            earliest[cell] = math.ceil(ticks - 1e-9)
+    return earliest

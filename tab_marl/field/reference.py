@@ -69,9 +69,7 @@ class Reference:
         return sparse.csr_array(redraw @ moves)
 
 
-def from_matrices(
-    transitions: object, mix: ArrayLike | None = None, headings: ArrayLike | None = None
-) -> Reference:
+def from_matrices(transitions: object, mix: ArrayLike | None = None, headings: ArrayLike | None = None) -> Reference:
     """A reference from ``[S, S]`` matrices (dense or any SciPy sparse), one or a sequence of R.
 
     Args:
@@ -123,7 +121,9 @@ def from_matrices(
 def _check_rows(matrix: sparse.csr_array, name: str) -> None:
     bad = ~np.isfinite(matrix.data) | (matrix.data < 0)
     if bad.any():
-        raise ValueError(f"{name} has the entry {matrix.data[bad][0]}: transition probabilities must be finite and >= 0")
+        raise ValueError(
+            f"{name} has the entry {matrix.data[bad][0]}: transition probabilities must be finite and >= 0"
+        )
     sums = np.asarray(matrix.sum(axis=1)).ravel()
     if len(sums) and sums.max() > 1 + 1e-9:
         worst = int(sums.argmax())
