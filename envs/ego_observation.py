@@ -1,0 +1,157 @@
+"""What the ego observes: its own state and the clock exactly, the adversary only under a camera, and the lidar.
+
+The layout is the table `ego_rows`; values are in metres, seconds, m/s and rad/s, one float32 per row:
+
+==========================  ==========================================================================================
+row                         meaning
+==========================  ==========================================================================================
+x, y                        own centre [m]
+cos, sin                    own heading
+v, w                        own speed [m/s] and turn rate [rad/s]
+elapsed, left               seconds since the start and until the horizon
+seen                        1 while a checkpoint camera sees the adversary (always 1 under `full_observation`), else 0
+adversary x, y, cos, sin,   the adversary's state while seen, else 0
+v, w
+lidar 0 ..                  free distance [m], anticlockwise, the first ray along the heading
+==========================  ==========================================================================================
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import ArrayLike, NDArray
+
+from tab_marl.envs.physics import Motion
+from tab_marl.world.scenario import Robot, Scenario
+
+ROWS_WITHOUT_LIDAR = 15
+TIME_BOUND_SECONDS = 600.0
+"""Bound of the two clocks, the same for shorter horizons, so that tasks of different length share one space."""
+_SEEN = 8
+_UNSEEN = (0.0,) * 7
+
+
+class Row(NamedTuple):
+    """One number of an observation."""
+
+    name: str
+    low: float
+    high: float
+
+
+def ego_rows(scenario: Scenario) -> tuple[Row, ...]:
+    """The layout of the ego's observation, in order."""
+    w, h = scenario.width_metres, scenario.height_metres
+    horizon = max(scenario.horizon_seconds, TIME_BOUND_SECONDS)
+    return (
+        *robot_rows("", scenario.ego, w, h),
+        Row("elapsed", 0.0, horizon),
+        Row("left", 0.0, horizon),
+        Row("seen", 0.0, 1.0),
+        *robot_rows("adversary ", scenario.adversary, w, h),
+        *(Row(f"lidar {i}", 0.0, scenario.sensors.lidar_metres) for i in range(scenario.sensors.lidar_rays)),
+    )
+
+
+def robot_rows(prefix: str, robot: Robot, width: float, height: float) -> tuple[Row, ...]:
+    """Six rows of a robot's state: x, y, cos, sin, v, w."""
+    # A wall can push a robot backwards, hence a speed below zero.
+    return (
+        Row(prefix + "x", 0.0, width),
+        Row(prefix + "y", 0.0, height),
+        Row(prefix + "cos", -1.0, 1.0),
+        Row(prefix + "sin", -1.0, 1.0),
+        Row(prefix + "v", -robot.max_speed, robot.max_speed),
+        Row(prefix + "w", -robot.max_turn_rate, robot.max_turn_rate),
+    )
+
+
+def ego_space(scenario: Scenario) -> Box:
+    """The Box of `ego_rows`, float32."""
+    return box_of(ego_rows(scenario))
+
+
+def box_of(rows: Sequence[Row]) -> Box:
+    """The bounded float32 Box of a layout table."""
+    low = np.array([row.low for row in rows], dtype=np.float32)
+    high = np.array([row.high for row in rows], dtype=np.float32)
+    return Box(low, high, dtype=np.float32)
+
+
+def observe_ego(
+    own: Motion,
+    elapsed: float,
+    left: float,
+    adversary: Motion | None,
+    ranges: NDArray[np.float64] | None,
+    limits: tuple[float, float],
+) -> NDArray[np.float32]:
+    """The observation ``[15 + rays]``; `adversary` is None while unseen, `limits` the top speeds of ego and adversary."""
+    values = [*robot_values(own, limits[0]), elapsed, left]
+    if adversary is None:
+        values += _UNSEEN
+    else:
+        values.append(1.0)
+        values += robot_values(adversary, limits[1])
+    if ranges is not None:
+        values += ranges.tolist()
+    return np.array(values, dtype=np.float32)
+
+
+def robot_values(motion: Motion, top_speed: float) -> tuple[float, float, float, float, float, float]:
+    """The values of `robot_rows`; a speed beyond the top speed (a robot that was pushed) is clipped."""
+    x, y, theta, v, w = motion
+    return (x, y, math.cos(theta), math.sin(theta), min(max(v, -top_speed), top_speed), w)
+
+
+@dataclass(frozen=True, slots=True)
+class AdversaryView:
+    """The adversary's state as a camera reports it: metres, rad, m/s, rad/s."""
+
+    x: float
+    y: float
+    theta: float
+    v: float
+    w: float
+
+
+@dataclass(frozen=True, slots=True)
+class EgoView:
+    """An ego observation with names: metres, rad in [-pi, pi], m/s, rad/s, seconds."""
+
+    x: float
+    y: float
+    theta: float
+    v: float
+    w: float
+    seconds: float
+    """Since the start of the episode."""
+    seconds_left: float
+    """Until the horizon."""
+    adversary: AdversaryView | None
+    """None while no camera sees it."""
+    lidar: NDArray[np.float32]
+    """``[rays]`` metres."""
+
+
+def parse_ego_observation(observation: ArrayLike) -> EgoView:
+    """Read an ego observation by name. Raises ValueError on a wrong shape."""
+    array = np.asarray(observation, dtype=np.float32)
+    if array.ndim != 1 or array.shape[0] < ROWS_WITHOUT_LIDAR:
+        raise ValueError(
+            f"an ego observation has shape [{ROWS_WITHOUT_LIDAR} + lidar rays], got {list(array.shape)}: "
+            "pass the array that the environment returned for 'ego_0'"
+        )
+    o = array[:ROWS_WITHOUT_LIDAR].tolist()
+    adversary = None
+    if o[_SEEN] > 0.5:
+        adversary = AdversaryView(o[9], o[10], math.atan2(o[12], o[11]), o[13], o[14])
+    return EgoView(
+        o[0], o[1], math.atan2(o[3], o[2]), o[4], o[5], o[6], o[7], adversary, array[ROWS_WITHOUT_LIDAR:]
+    )  # fmt: skip

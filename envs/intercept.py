@@ -1,0 +1,304 @@
+"""The interception environment: PettingZoo's ParallelEnv around an Episode. Glue only; every part is a module beside it.
+
+Agents are ``ego_0`` and ``adversary_0``; both act in ``[-1, 1]^2``: ``a[0]`` is the speed, from -1 (stand still) to 1
+(top speed), ``a[1]`` the turn rate, from -1 (clockwise at the top rate) to 1. Values beyond are clipped; NaN and
+infinities are refused. One step is one control step (0.1 s, ten physics substeps). An episode ends at interception
+(terminated) or at the horizon (truncated); with `end_on_completion` also when the mission is completed or fails.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import ArrayLike, NDArray
+from pettingzoo import ParallelEnv
+
+from tab_marl.envs.adversary_side import AdversarySide, adversary_space, as_style, notices_ego
+from tab_marl.envs.ego_observation import Row, box_of, ego_rows, ego_space, observe_ego, robot_rows, robot_values
+from tab_marl.envs.episode import Episode, check_start, draw_starts
+from tab_marl.envs.heat import HeatSource, heat_source
+from tab_marl.envs.lidar import Lidar
+from tab_marl.envs.mission_scene import mission_scene
+from tab_marl.envs.reward import AdversaryRewards, Events, adversary_reward, ego_reward
+from tab_marl.envs.styles import Style
+from tab_marl.envs.task_source import TaskSource, task_source
+from tab_marl.mission import Mission, to_english
+from tab_marl.mission.tasks import Task
+from tab_marl.world.scenario import Robot, Scenario
+
+if TYPE_CHECKING:
+    from tab_marl.envs.live_view import LiveView
+
+EGO_AGENT, ADVERSARY_AGENT = "ego_0", "adversary_0"
+AGENTS = (EGO_AGENT, ADVERSARY_AGENT)
+RENDER_MODES = ("human", "rgb_array")
+
+Observations = dict[str, NDArray[np.float32]]
+Infos = dict[str, dict[str, Any]]
+
+
+class InterceptEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
+    """An ego that must intercept an adversary with a mission. See the module's and `__init__`'s descriptions."""
+
+    metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]
+        "name": "tab_marl_intercept_v0",
+        "render_modes": list(RENDER_MODES),
+        "render_fps": 10,
+        "is_parallelizable": True,
+    }
+
+    def __init__(
+        self,
+        task: Task | TaskSource | None = None,
+        mission: str | Mission = "M1",
+        scenario: str | Scenario = "lab",
+        family: str = "point",
+        adversary_style: Style | str | None = None,
+        render_mode: str | None = None,
+        end_on_completion: bool = False,
+        full_observation: bool = False,
+        max_cycles: int | None = None,
+        adversary_rewards: AdversaryRewards | None = None,
+        show_lidar: bool = False,
+    ) -> None:
+        """`task`, `mission`, `scenario`, `family`: what is played, see `task_source`.
+
+        `adversary_style`: a Style or a style's name for the routes that the adversary observes; None is the direct one.
+        `end_on_completion`: the episode also ends when the mission is completed or fails.
+        `full_observation`: the ego sees the adversary always.
+        `max_cycles`: the most control steps, if fewer than the horizon's.
+        """
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            raise ValueError(f"render_mode is {render_mode!r}, must be None or one of {list(RENDER_MODES)}")
+        if max_cycles is not None and max_cycles < 1:
+            raise ValueError(f"max_cycles is {max_cycles}, must be >= 1 or None (the scenario's horizon)")
+        self.render_mode = render_mode
+        self.end_on_completion = end_on_completion
+        self.full_observation = full_observation
+        self.max_cycles = max_cycles
+        self.adversary_style = as_style(adversary_style)
+        self.adversary_rewards = adversary_rewards or AdversaryRewards()
+        self.possible_agents = list(AGENTS)
+        self.agents: list[str] = []
+        self._source = task_source(task, mission, scenario, family)
+        self._rng = np.random.default_rng()
+        self._view: LiveView | None = None
+        self._show_lidar = show_lidar
+        self._heat: HeatSource = heat_source(None, None)
+        self._heat_label = "belief"
+        self._episode: Episode | None = None
+        self._over = False
+        # The spaces come from a first task, drawn from a generator of its own so that episodes do not depend on it.
+        self._shape_of = self._source(np.random.default_rng(0)).scenario
+        self.observation_spaces = {EGO_AGENT: ego_space(self._shape_of), ADVERSARY_AGENT: adversary_space()}
+        self.action_spaces = {agent: Box(-1.0, 1.0, (2,), dtype=np.float32) for agent in AGENTS}
+        self.state_space = box_of(_state_rows(self._shape_of))
+
+    @property
+    def episode(self) -> Episode:
+        """The running episode. Raises RuntimeError before the first reset."""
+        if self._episode is None:
+            raise RuntimeError("there is no episode yet: call reset first")
+        return self._episode
+
+    @property
+    def task(self) -> Task:
+        """The task of the running episode."""
+        return self.episode.task
+
+    def spawn_generator(self) -> np.random.Generator:
+        """A generator of its own that follows from the seed of the last seeded reset: for opponents."""
+        return self._rng.spawn(1)[0]
+
+    def observation_space(self, agent: str) -> Box:
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> Box:
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Observations, Infos]:
+        """Begin an episode. `options` may hold "task" (a Task), "ego_start" and "adversary_start" (x, y, theta);
+        other keys are ignored. The same seed, options and actions give the same episode.
+        """
+        if seed is not None:
+            self._rng = np.random.default_rng(seed)
+        rng, options = self._rng, options or {}
+        task = options.get("task") or self._source(rng)
+        scenario: Scenario = task.scenario
+        self._check_shape(scenario)
+        given = {name: check_start(scenario, options[name], name) for name in ("ego_start", "adversary_start") if name in options}  # fmt: skip
+        starts = draw_starts(scenario, rng, given.get("ego_start"), given.get("adversary_start"))
+        control_seconds = 1.0 / scenario.control_hertz
+        self._control_seconds = control_seconds
+        self._side = AdversarySide(task, self.adversary_style, rng)
+        self._lidar = Lidar.of(scenario) if scenario.sensors.lidar_rays else None
+        self._last_step = round(scenario.horizon_seconds * scenario.control_hertz)
+        if self.max_cycles is not None:
+            self._last_step = min(self._last_step, self.max_cycles)
+        self._episode = Episode(task, self._side.monitor, *starts)
+        self._over = False
+        self.agents = list(AGENTS)
+        if self._view is not None:
+            self._start_view()
+        if self.render_mode == "human":
+            self.render()
+        return self._observe(), self._infos(Events())
+
+    def step(
+        self, actions: Mapping[str, ArrayLike]
+    ) -> tuple[Observations, dict[str, float], dict[str, bool], dict[str, bool], Infos]:
+        """Advance by one control step. Raises ValueError for a missing, malformed or non-finite action."""
+        episode = self.episode
+        if self._over:
+            if not actions:
+                return {}, {}, {}, {}, {}
+            raise RuntimeError("the episode is over: call reset")
+        scenario = episode.scenario
+        events = episode.step(
+            _command(actions, EGO_AGENT, scenario.ego), _command(actions, ADVERSARY_AGENT, scenario.adversary)
+        )  # fmt: skip
+        ended = events.intercepted or (self.end_on_completion and (events.completed or events.failed))
+        truncated = not ended and episode.control_steps >= self._last_step
+        seconds = self._control_seconds
+        rewards = {
+            EGO_AGENT: ego_reward(events, episode.motion[0], scenario, seconds),
+            ADVERSARY_AGENT: adversary_reward(events, self.adversary_rewards, scenario, seconds),
+        }
+        self._over = ended or truncated
+        if self._over:
+            self.agents = []
+        result = (
+            self._observe(),
+            rewards,
+            {EGO_AGENT: ended, ADVERSARY_AGENT: ended},
+            {EGO_AGENT: truncated, ADVERSARY_AGENT: truncated},
+            self._infos(events),
+        )
+        if self.render_mode == "human":
+            self.render()
+        return result
+
+    def state(self) -> NDArray[np.float32]:
+        """The whole state ``[15]``: both robots (x, y, cos, sin, v, w), seconds elapsed and left, and the mission's
+        status (0 under way, 1 completed, -1 failed)."""
+        episode = self.episode
+        scenario = episode.scenario
+        ego, adversary = episode.motion
+        elapsed = episode.seconds
+        status = {"completed": 1.0, "failed": -1.0}.get(episode.monitor.status, 0.0)
+        values = [*robot_values(ego, scenario.ego.max_speed), *robot_values(adversary, scenario.adversary.max_speed)]
+        return np.array([*values, elapsed, self._left(elapsed), status], dtype=np.float32)
+
+    def set_field(self, field: Any, label: str = "belief") -> None:
+        """Lay a belief or field over the map in every picture from now on; None removes it.
+
+        `field`: an image ``[rows, columns]`` (row 0 at the bottom), a pair (GridMap, values ``[cells]``), values
+        ``[cells]`` on the scenario's grid of 0.1 or 0.05 m, or a function without arguments that returns one of these.
+        """
+        self._heat = heat_source(field, self._shape_of if self._episode is None else self._episode.scenario)
+        self._heat_label = label
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """The picture ``[height, width, 3]`` in mode "rgb_array"; None in mode "human", which shows it in a window."""
+        if self.render_mode is None:
+            raise RuntimeError(f"render() needs a render_mode: make the environment with one of {list(RENDER_MODES)}")
+        if self._view is None:
+            from tab_marl.envs.live_view import LiveView  # loads pygame
+
+            self._view = LiveView("tab-marl: intercept", self._show_lidar)
+            self._start_view()
+        frame = self._view.frame(self.episode, self._heat(), self._heat_label, self._over)
+        if self.render_mode == "rgb_array":
+            return self._view.array(frame)
+        self._view.show(frame, self.metadata["render_fps"])
+        return None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._view is not None:
+            self._view.close()
+            self._view = None
+
+    def _start_view(self) -> None:
+        if self._view is not None:
+            task = self.task
+            self._view.start(task.scenario, mission_scene(task.mission, task.scenario, to_english(task.mission)))
+
+    def _observe(self) -> Observations:
+        episode = self.episode
+        ego, adversary = episode.motion
+        scenario = episode.scenario
+        elapsed = episode.seconds
+        seen = adversary if episode.seen_by or self.full_observation else None
+        ranges = None if self._lidar is None else self._lidar.scan(ego.x, ego.y, ego.theta)
+        limits = (scenario.ego.max_speed, scenario.adversary.max_speed)
+        noticed = ego if notices_ego(scenario, adversary, ego) else None
+        return {
+            EGO_AGENT: observe_ego(ego, elapsed, self._left(elapsed), seen, ranges, limits),
+            ADVERSARY_AGENT: self._side.observe(adversary, noticed),
+        }
+
+    def _left(self, elapsed: float) -> float:
+        return max(0.0, self._last_step * self._control_seconds - elapsed)
+
+    def _infos(self, events: Events) -> Infos:
+        episode = self.episode
+        monitor = episode.monitor
+        common: dict[str, Any] = {
+            "intercepted": events.intercepted,
+            "mission_status": monitor.status,
+            "why_failed": monitor.why_failed,
+            "completed_seconds": episode.completed_seconds,
+            "physics_steps": episode.physics_steps,
+        }
+        return {
+            EGO_AGENT: {**common, "collided": events.ego_collided},
+            ADVERSARY_AGENT: {**common, "collided": events.adversary_collided},
+        }
+
+    def _check_shape(self, scenario: Scenario) -> None:
+        """A task drawn or given at reset must fit the spaces, which cannot change."""
+        space, rows = self.observation_spaces[EGO_AGENT], ego_rows(scenario)
+        if len(rows) != space.shape[0]:
+            raise ValueError(
+                f"the task's scenario {scenario.name!r} has {scenario.sensors.lidar_rays} lidar rays, the environment was "
+                f"made for {self._shape_of.sensors.lidar_rays}: make an environment for it"
+            )
+        for row, high in zip(rows, space.high.tolist(), strict=True):
+            if row.high > high * (1 + 1e-6):
+                raise ValueError(
+                    f"the task's scenario {scenario.name!r} needs {row.name} up to {row.high:g}, the environment was made "
+                    f"for {high:g}: make an environment for it"
+                )
+
+
+def _state_rows(scenario: Scenario) -> tuple[Row, ...]:
+    rows = {row.name: row for row in ego_rows(scenario)}
+    w, h = scenario.width_metres, scenario.height_metres
+    return (
+        *robot_rows("ego ", scenario.ego, w, h),
+        *robot_rows("adversary ", scenario.adversary, w, h),
+        rows["elapsed"],
+        rows["left"],
+        Row("mission", -1.0, 1.0),
+    )
+
+
+def _command(actions: Mapping[str, ArrayLike], agent: str, robot: Robot) -> tuple[float, float]:
+    """(v [m/s], w [rad/s]) of an agent's action."""
+    if agent not in actions:
+        raise ValueError(f"actions lack {agent!r}: every living agent must act, got {sorted(actions)}")
+    action = np.asarray(actions[agent])
+    if action.shape != (2,):
+        raise ValueError(f"the action of {agent!r} has shape {list(action.shape)}, must be [2] (speed, turn rate)")
+    speed, turn = action.tolist()
+    if not (math.isfinite(speed) and math.isfinite(turn)):
+        raise ValueError(f"the action of {agent!r} is {[speed, turn]}, must be finite numbers in [-1, 1]")
+    speed, turn = min(max(speed, -1.0), 1.0), min(max(turn, -1.0), 1.0)
+    return (0.5 * (speed + 1.0) * robot.max_speed, turn * robot.max_turn_rate)

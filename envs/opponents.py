@@ -1,0 +1,177 @@
+"""Scripted players for the side that does not learn: a name, an object with `act(observation)`, or a plain function.
+
+==========  ==========  ==============================================================================================
+name        side        what it does
+==========  ==========  ==============================================================================================
+static      either      stands still
+random      either      a new random action every half second
+follow      adversary   follows the route that its observation shows, and waits where it would be too early
+pursue      ego         drives to where a camera last saw the adversary, round obstacles, and waits there
+==========  ==========  ==============================================================================================
+
+An object may also have `reset(task, rng)`, called at the start of every episode.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tab_marl.envs.ego_observation import parse_ego_observation
+from tab_marl.envs.lidar import Lidar
+from tab_marl.mission.tasks import Task
+from tab_marl.world.grid import GridMap
+from tab_marl.world.kernels import steer
+from tab_marl.world.scenario import UnknownName
+
+Action = NDArray[np.float32]
+
+STAND_STILL = np.array([-1.0, 0.0], dtype=np.float32)
+HOLD_SECONDS = 0.5
+"""How long a random player keeps its action, and how often a pursuer plans anew."""
+EARLY_SECONDS = 0.2
+"""A follower that would arrive so much too early waits."""
+CELL_METRES = 0.1
+LOOK_METRES = 0.8
+"""How far ahead a pursuer looks for the next point of its way."""
+CLEARANCE_METRES = 0.02
+"""Between a pursuer and obstacles, where the map allows it."""
+
+
+@runtime_checkable
+class Player(Protocol):
+    """What plays one side."""
+
+    def act(self, observation: NDArray[np.float32]) -> Action:
+        """The action ``[2]`` in [-1, 1] for an observation of this side."""
+        ...
+
+
+class Static:
+    """Stands still."""
+
+    def act(self, observation: NDArray[np.float32]) -> Action:
+        return STAND_STILL
+
+
+class Random:
+    """A random action, held for HOLD_SECONDS."""
+
+    def reset(self, task: Task, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self._hold = round(HOLD_SECONDS * task.scenario.control_hertz)
+        self._step = 0
+        self._action = STAND_STILL
+
+    def act(self, observation: NDArray[np.float32]) -> Action:
+        if self._step % self._hold == 0:
+            self._action = self._rng.uniform(-1.0, 1.0, 2).astype(np.float32)
+        self._step += 1
+        return self._action
+
+
+class Follow:
+    """Follows the route in the adversary's observation (rows of `adversary_observation`)."""
+
+    def reset(self, task: Task, rng: np.random.Generator) -> None:
+        scenario = task.scenario
+        self._max_turn = scenario.adversary.max_turn_rate
+        self._seconds = 1.0 / scenario.control_hertz
+
+    def act(self, observation: NDArray[np.float32]) -> Action:
+        forward, left, near, speed_limit = (float(observation[i]) for i in (0, 1, 2, 15))
+        timed, excess_seconds = observation[9] > 0.5, 10.0 * float(observation[10])
+        if (forward == 0.0 and left == 0.0) or near == 0.0:
+            return STAND_STILL
+        error = math.atan2(left, forward)
+        turn = min(max(error / self._seconds / self._max_turn, -1.0), 1.0)
+        speed = max(forward, 0.0) if forward > 0.5 else 0.0
+        if timed and excess_seconds > EARLY_SECONDS:
+            speed = 0.0
+        return np.array([2.0 * min(speed, speed_limit) - 1.0, turn], dtype=np.float32)
+
+
+class Pursue:
+    """Drives to the latest sighting by the shortest free way."""
+
+    def reset(self, task: Task, rng: np.random.Generator) -> None:
+        self._scenario = task.scenario
+        self._seconds = 1.0 / task.scenario.control_hertz
+        self._replan = round(HOLD_SECONDS * task.scenario.control_hertz)
+        self._grid = GridMap.from_scenario(
+            task.scenario, CELL_METRES, task.scenario.ego.radius_metres + CLEARANCE_METRES
+        )
+        self._lidar = Lidar.of(task.scenario)
+        self._target: tuple[float, float] | None = None
+        self._to_go: NDArray[np.float64] | None = None
+        self._step = 0
+
+    def act(self, observation: NDArray[np.float32]) -> Action:
+        view = parse_ego_observation(observation)
+        if view.adversary is not None and (self._to_go is None or self._step % self._replan == 0):
+            self._target = (view.adversary.x, view.adversary.y)
+            self._to_go = self._grid.distances(self._grid.cells_of([self._target]))
+        self._step += 1
+        if self._target is None or self._to_go is None:
+            return STAND_STILL
+        x, y = self._waypoint(view.x, view.y, self._target, self._to_go)
+        robot = self._scenario.ego
+        v, w = steer(view.x, view.y, view.theta, x, y, robot.max_speed, robot.max_turn_rate, self._seconds)
+        return np.array([2.0 * v / robot.max_speed - 1.0, w / robot.max_turn_rate], dtype=np.float32)
+
+    def _waypoint(
+        self, x: float, y: float, target: tuple[float, float], to_go: NDArray[np.float64]
+    ) -> tuple[float, float]:
+        """The point in plain sight from which the rest of the way is shortest."""
+        centres = self._grid.centres
+        distance = np.hypot(centres[:, 0] - x, centres[:, 1] - y)
+        for cell in np.argsort(np.where(distance <= LOOK_METRES, to_go, np.inf))[:40]:
+            cx, cy = float(centres[cell, 0]), float(centres[cell, 1])
+            if self._wide_view(x, y, cx, cy):
+                return (cx, cy) if to_go[cell] > CELL_METRES else target
+        return target
+
+    def _wide_view(self, x: float, y: float, to_x: float, to_y: float) -> bool:
+        """Whether the robot's whole width passes on the straight line."""
+        length = math.hypot(to_x - x, to_y - y)
+        if length == 0.0:
+            return True
+        radius = self._scenario.ego.radius_metres
+        ox, oy = -(to_y - y) / length * radius, (to_x - x) / length * radius
+        return all(self._lidar.sees(x + s * ox, y + s * oy, to_x + s * ox, to_y + s * oy) for s in (-1.0, 0.0, 1.0))
+
+
+class Function:
+    """A plain function of the observation, as a player."""
+
+    def __init__(self, function: Callable[[NDArray[np.float32]], Any]) -> None:
+        self._function = function
+
+    def act(self, observation: NDArray[np.float32]) -> Action:
+        return np.asarray(self._function(observation), dtype=np.float32)
+
+
+OPPONENTS: dict[str, dict[str, Callable[[], Player]]] = {
+    "ego": {"static": Static, "random": Random, "pursue": Pursue},
+    "adversary": {"static": Static, "random": Random, "follow": Follow},
+}
+"""Side -> name -> player."""
+
+
+def make_opponent(opponent: str | Player | Callable[[NDArray[np.float32]], Any], side: str) -> Player:
+    """The player of a side. Raises UnknownName for a name it lacks, TypeError for what cannot act."""
+    if isinstance(opponent, str):
+        if opponent not in OPPONENTS[side]:
+            raise UnknownName(f"scripted {side}", opponent, OPPONENTS[side])
+        return OPPONENTS[side][opponent]()
+    if isinstance(opponent, Player):
+        return opponent
+    if callable(opponent):
+        return Function(opponent)
+    raise TypeError(
+        f"opponent is {opponent!r}, must be one of {list(OPPONENTS[side])}, have act(observation), or be a function"
+    )

@@ -1,0 +1,190 @@
+"""The pymunk world of one episode: walls, obstacles and two differential-drive robots, stepped at `Scenario.physics_hertz`.
+
+How a robot is driven. Its body is tied by a pivot joint and a gear joint to a kinematic "wheel" body that turns at the
+commanded rate w; the pivot's anchor on the wheel lies at the instantaneous centre of rotation, so the anchor runs along
+the commanded arc. The joints correct velocity only (``max_bias = 0``) and with bounded force, so a wall wins. Everything
+happens inside Chipmunk: one set of Python calls per control step instead of one per substep. In free space the motion
+equals the exact unicycle arc to rounding (the anchor is set half a substep ahead, so that each substep moves along the
+chord); against a wall the robot slides without friction and sinks in by a millimetre or two for one substep.
+
+A Space keeps a hidden contact cache, so its state cannot be restored exactly: every episode builds a fresh Arena.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import pymunk
+from pymunk import Body, Circle, GearJoint, PivotJoint, Poly, Shape, Space
+
+from tab_marl.world.regions import Disc, Region
+from tab_marl.world.scenario import Robot, Scenario
+
+Start = tuple[float, float, float]
+"""x [m], y [m], theta [rad]."""
+
+EGO, ADVERSARY = 0, 1
+"""Index of each robot in an Arena."""
+
+WALL_METRES = 0.5
+"""Walls are thick, outside the arena, so that nothing passes them."""
+SLOP_METRES = 1e-4
+"""Overlap that contacts tolerate; pymunk's default is 0.1, a third of an arm's length here."""
+MOTOR_STRENGTH = 4.0
+"""A motor can change its robot's velocity by this many times the top speed in one substep, no more."""
+STRAIGHT_TURN_RATE = 1e-6
+"""rad/s; slower turns count as straight, to keep the turning circle's radius finite."""
+
+_ROBOT_TYPES, _SOLID_TYPE = (1, 2), 3
+
+# Bound property functions: pymunk runs a Python __setattr__ on every assignment, and these skip it.
+_get_position, _set_position = Body.position.fget, Body.position.fset
+_get_angle, _set_angle = Body.angle.fget, Body.angle.fset
+_get_velocity, _set_velocity = Body.velocity.fget, Body.velocity.fset
+_set_turn_rate = Body.angular_velocity.fset
+_set_anchor = PivotJoint.anchor_a.fset
+
+
+class Motion(NamedTuple):
+    """Where a robot is and how it moves."""
+
+    x: float
+    """metres"""
+    y: float
+    """metres"""
+    theta: float
+    """rad, anticlockwise from the x axis; not wrapped"""
+    v: float
+    """m/s along the heading"""
+    w: float
+    """rad/s"""
+
+
+class Arena:
+    """The bodies of one episode. Robots are EGO and ADVERSARY; commands hold until the next `command`."""
+
+    def __init__(self, scenario: Scenario, starts: tuple[Start, Start]) -> None:
+        """`starts` of the ego and of the adversary."""
+        self.substep_seconds = 1.0 / scenario.physics_hertz
+        self.touching = [False, False]
+        """Whether each robot touched a wall or an obstacle since the last `command`."""
+        self._space = Space()
+        self._space.collision_slop = SLOP_METRES
+        for shape in _solids(scenario, self._space.static_body):
+            shape.collision_type = _SOLID_TYPE
+            shape.friction = 0.0
+            self._space.add(shape)
+        self._drives = [
+            _Drive(self._space, robot, pose, self.substep_seconds, kind)
+            for robot, pose, kind in zip((scenario.ego, scenario.adversary), starts, _ROBOT_TYPES, strict=True)
+        ]
+        self._contacts = [0, 0]
+        for robot in (EGO, ADVERSARY):
+            self._space.on_collision(
+                _ROBOT_TYPES[robot], _SOLID_TYPE, begin=self._on_begin, separate=self._on_separate, data=robot
+            )
+        self._step = self._space.step
+
+    def _on_begin(self, arbiter: pymunk.Arbiter, space: Space, robot: Any) -> None:
+        self._contacts[robot] += 1
+        self.touching[robot] = True
+
+    def _on_separate(self, arbiter: pymunk.Arbiter, space: Space, robot: Any) -> None:
+        self._contacts[robot] -= 1
+
+    def command(self, ego: tuple[float, float], adversary: tuple[float, float]) -> None:
+        """Command (speed [m/s], turn rate [rad/s]) of both robots; call before a run of substeps."""
+        self._drives[EGO].command(*ego, self.touching[EGO])
+        self._drives[ADVERSARY].command(*adversary, self.touching[ADVERSARY])
+        self.touching[EGO] = self._contacts[EGO] > 0
+        self.touching[ADVERSARY] = self._contacts[ADVERSARY] > 0
+
+    def substep(self) -> None:
+        """Advance by one physics substep."""
+        self._step(self.substep_seconds)
+
+    def run(self, substeps: int) -> None:
+        """Advance by so many physics substeps."""
+        step, seconds = self._step, self.substep_seconds
+        for _ in range(substeps):
+            step(seconds)
+
+    def squared_gap(self) -> float:
+        """Squared distance between the robots' centres, square metres."""
+        x, y = _get_position(self._drives[0].body)
+        other_x, other_y = _get_position(self._drives[1].body)
+        return float((x - other_x) ** 2 + (y - other_y) ** 2)
+
+    def motion(self, robot: int) -> Motion:
+        """The robot's motion now; against a wall v is what the wall leaves of the command."""
+        drive = self._drives[robot]
+        x, y = _get_position(drive.body)
+        theta = _get_angle(drive.body)
+        v = drive.v
+        if self.touching[robot]:
+            vx, vy = _get_velocity(drive.body)
+            v = vx * math.cos(theta) + vy * math.sin(theta)
+        return Motion(x, y, theta, v, drive.w)
+
+
+class _Drive:
+    """One robot: its body, the wheel that leads it and the two joints between them."""
+
+    __slots__ = ("_pivot", "_substep_seconds", "_wheel", "body", "v", "w")
+
+    def __init__(self, space: Space, robot: Robot, pose: Start, substep_seconds: float, kind: int) -> None:
+        mass, radius = robot.mass_kilograms, robot.radius_metres
+        self._substep_seconds = substep_seconds
+        self.v = self.w = 0.0
+        self.body = Body(mass, pymunk.moment_for_circle(mass, 0.0, radius))
+        self.body.position = pose[0], pose[1]
+        self.body.angle = pose[2]
+        hull = Circle(self.body, radius)
+        hull.friction = 0.0
+        hull.collision_type = kind
+        self._wheel = Body(body_type=Body.KINEMATIC)
+        self._wheel.position = self.body.position
+        self._wheel.angle = pose[2]
+        self._pivot = PivotJoint(self._wheel, self.body, (0.0, 0.0), (0.0, 0.0))
+        gear = GearJoint(self._wheel, self.body, 0.0, 1.0)
+        self._pivot.max_bias = gear.max_bias = 0.0
+        self._pivot.max_force = MOTOR_STRENGTH * mass * robot.max_speed / substep_seconds
+        gear.max_force = MOTOR_STRENGTH * self.body.moment * robot.max_turn_rate / substep_seconds
+        space.add(self.body, hull, self._wheel, self._pivot, gear)
+
+    def command(self, v: float, w: float, touching: bool) -> None:
+        self.v, self.w = v, w
+        theta = _get_angle(self.body)
+        half_turn = 0.5 * w * self._substep_seconds
+        _set_angle(self._wheel, theta)
+        _set_turn_rate(self._wheel, w)
+        if -STRAIGHT_TURN_RATE < w < STRAIGHT_TURN_RATE:
+            velocity = (v * math.cos(theta), v * math.sin(theta))
+            _set_anchor(self._pivot, (0.0, 0.0))
+            _set_velocity(self._wheel, velocity)
+        else:
+            # The chord of one substep is shorter than its arc by sin(a)/a, and turned by a, half the substep's turn.
+            chord_speed = v * math.sin(half_turn) / half_turn
+            velocity = (chord_speed * math.cos(theta + half_turn), chord_speed * math.sin(theta + half_turn))
+            radius = chord_speed / w
+            _set_anchor(self._pivot, (radius * math.sin(half_turn), -radius * math.cos(half_turn)))
+            _set_velocity(self._wheel, (0.0, 0.0))
+        # Positions move with the old velocity before the joints act. In free space the new one is set at once, so that a
+        # command does not lag a substep; in contact it is left to the solver, which would otherwise be pushed into the wall.
+        if not touching:
+            _set_velocity(self.body, velocity)
+            _set_turn_rate(self.body, w)
+
+
+def _solids(scenario: Scenario, static: Body) -> list[Shape]:
+    w, h, t = scenario.width_metres, scenario.height_metres, WALL_METRES
+    walls = ((-t, -t, 0.0, h + t), (w, -t, w + t, h + t), (-t, -t, w + t, 0.0), (-t, h, w + t, h + t))
+    shapes: list[Shape] = [Poly(static, [(a, b), (c, b), (c, d), (a, d)]) for a, b, c, d in walls]
+    return shapes + [_solid(obstacle, static) for obstacle in scenario.obstacles]
+
+
+def _solid(obstacle: Region, static: Body) -> Shape:
+    if isinstance(obstacle, Disc):
+        return Circle(static, obstacle.radius, obstacle.centre)
+    return Poly(static, [(float(x), float(y)) for x, y in obstacle.vertices()])
