@@ -152,8 +152,6 @@ def _beside(mission: Mission, constraint: Constraint, at_start: bool) -> str:
         text += f" until {_seconds(constraint.seconds)}"
     elif constraint.until_goal is not None:
         text += f" until {_goal_reference(mission, constraint.until_goal)}"
-    if constraint.speed_limit is not None:
-        text += f" and never going faster than {plain_number(constraint.speed_limit)} m/s"
     return text
 
 
@@ -175,7 +173,9 @@ def _joined(names: list[str], word: str) -> str:
 
 
 def _the(place: Place) -> str:
-    name = place_name(place)
+    if not isinstance(place, str):
+        return f"target {place_name(place)}"
+    name = place
     return f"the {name}" if name[0].islower() else name
 
 

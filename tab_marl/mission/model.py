@@ -61,7 +61,7 @@ class Constraint:
     presence: bool = False
     """exact: be there at that time, however early the robot came (else its first entry must fall into the window)."""
     speed_limit: float | None = None
-    """m/s, while this constraint is current (`always`: throughout)."""
+    """m/s, while this constraint is current (`always`, in a constraint of its own: throughout)."""
     restricted: tuple[Place, ...] = ()
     """Places to keep out of while this constraint is current."""
     until_goal: int | None = None
@@ -142,6 +142,8 @@ class Constraint:
             if getattr(self, name) != default:
                 self._fail(name, "only goals (exact, deadline, eventually) have it")
         if self.type is ConstraintType.ALWAYS:
+            if self.speed_limit is not None and self.places:
+                self._fail("speed_limit", "must stand in an always constraint of its own, without places")
             for name in ("seconds", "until_goal"):
                 if getattr(self, name) is not None:
                     self._fail(name, "always never ends: use until, or leave it out")

@@ -256,7 +256,8 @@ class _Reader:
 
 
 def _goal(draft: Draft) -> Constraint:
-    return Constraint(**({"type": ConstraintType.EVENTUALLY} | draft))
+    fields: Draft = {"type": ConstraintType.EVENTUALLY} | draft
+    return Constraint(**fields)
 
 
 def _trees(tree: Tree[Token]) -> list[Tree[Token]]:
