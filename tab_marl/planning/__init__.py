@@ -1,0 +1,21 @@
+"""POMCP for any generative model, and the models that make it an interceptor.
+
+`Pomcp` plans; `CompiledModel`, `table_model` and `PythonModel` (see `tab_marl.planning.model`) say what it plans in.
+"""
+
+from __future__ import annotations
+
+from tab_marl.planning.model import CompiledModel, Particles, PythonModel, table_model
+from tab_marl.planning.pomcp import Plan, Pomcp, PomcpOptions
+from tab_marl.planning.tree import SearchTree
+
+__all__ = [
+    "CompiledModel",
+    "Particles",
+    "Plan",
+    "Pomcp",
+    "PomcpOptions",
+    "PythonModel",
+    "SearchTree",
+    "table_model",
+]

@@ -203,9 +203,12 @@ def grow_tree_in_python(
     while done < options.simulations:
         left = options.simulations - done
         chunk = left if deadline is None else min(16, left)
-        for particle in draw_particles(chunk, len(source.states), source.weights, rng).tolist():
-            depth, path_length = _simulate(tree, source, particle, options, horizon, tree_depth, most, model.actions)
-            deepest, steps = max(deepest, depth), steps + path_length
+        with np.errstate(over="ignore"):  # a model's random words wrap round
+            for particle in draw_particles(chunk, len(source.states), source.weights, rng).tolist():
+                depth, path_length = _simulate(
+                    tree, source, particle, options, horizon, tree_depth, most, model.actions
+                )
+                deepest, steps = max(deepest, depth), steps + path_length
         done += chunk
         if deadline is not None and time.perf_counter() >= deadline:
             break

@@ -5,6 +5,8 @@ a closure, which would compile anew in every process. Nothing here raises; `tab_
 `tab_marl.planning.interpreted` is the slow twin that must build the identical tree.
 """
 
+# mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators, no-check-untyped-defs
+
 from __future__ import annotations
 
 import math

@@ -22,6 +22,8 @@ from tab_marl.planning.tree import EDGE, NODE, ROOT, SearchTree
 
 _CHUNK = 256
 """Simulations between two looks at the clock."""
+_FIRST_NODES = 16384
+"""Nodes allocated at first; doubled when full."""
 _PRECISION = 0.01
 """Without `max_depth`: the weight of a reward beyond the horizon."""
 
@@ -250,7 +252,7 @@ def _grow_compiled(
     seeds = rng.integers(2**64, size=shared, dtype=np.uint64)
 
     most = min(options.max_nodes, options.simulations + 1)
-    size = min(most, 16384)
+    size = min(most, _FIRST_NODES)
     # Every simulation adds at most one node and expands at most one.
     nodes = np.empty(size, dtype=NODE)
     edges = np.empty(size * actions + len(root[0]), dtype=EDGE)

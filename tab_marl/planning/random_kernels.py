@@ -4,6 +4,8 @@ SplitMix64 (Steele, Lea and Flood, OOPSLA 2014). A model draws with `uniform` an
 numbers keeps the word in a local variable: ``word += GOLDEN; bits = mixed(word)`` and stores it back at the end.
 """
 
+# mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators, no-check-untyped-defs
+
 from __future__ import annotations
 
 import numpy as np

@@ -1,8 +1,11 @@
-"""Tag (Pineau, Gordon and Thrun, IJCAI 2003) as compiled functions; its tables are made in `tab_marl.planning.textbook`.
+"""Tag (Pineau, Gordon and Thrun, IJCAI 2003) as compiled functions, and a rollout for Tiger.
 
-State ``[robot cell, target cell]``. Everything is one look-up: the random word's upper half picks one of 5 equal slots of the
-target's moves, its lower half the robot's action in a rollout.
+Tag's tables are made in `tab_marl.planning.textbook`. Its state is ``[robot cell, target cell]``. Everything is one
+look-up: the random word's upper half picks one of 5 equal slots of the target's moves, its lower half the robot's action in a rollout.
+(``np.uint64(...)`` round a call keeps the type where the functions run interpreted.)
 """
+
+# mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators, no-check-untyped-defs
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ import numpy as np
 from numba import njit
 
 from tab_marl.planning.random_kernels import GOLDEN, bits, mixed
+from tab_marl.planning.table_kernels import draw
 
 TAG = 4
 CELLS = 29
@@ -31,15 +35,34 @@ def _low(word, count):
     return np.int64(((word & _LOW) * np.uint64(count)) >> _SHIFT)
 
 
+def patient_rollout(state, action, observation, depth, max_depth, discount, data, rng):
+    """Tiger: listen until one side was heard twice more often, open the other door, and again, to the end."""
+    tiger = np.int64(state[0])
+    total = 0.0
+    weight = 1.0
+    surplus = 0
+    for _ in range(depth, max_depth):
+        door = 0 if abs(surplus) < 2 else (2 if surplus > 0 else 1)
+        after = draw(data.transition, door * 2 + tiger, rng)
+        heard = draw(data.observation, door * 2 + after, rng)
+        total += weight * data.reward[door * 2 + tiger, after]
+        weight *= discount
+        tiger = after
+        surplus = surplus + 1 - 2 * heard if door == 0 else 0
+    return total
+
+
 def step(state, action, data, rng):
-    """One step; the target answers to where the robot was before it, and moves on after a failed tag too."""
+    """One step of Tag; the target answers to where the robot was before it, and moves on after a failed tag too."""
     robot, target = np.int64(state[0]), np.int64(state[1])
     reward = -1.0
     if action == TAG:
         if robot == target:
             return np.int64(SEES_TARGET), 10.0, True
         reward = -10.0
-    target = np.int64(data.target_moves[(robot * CELLS + target) * TARGET_SLOTS + _high(bits(rng), TARGET_SLOTS)])
+    target = np.int64(
+        data.target_moves[(robot * CELLS + target) * TARGET_SLOTS + _high(np.uint64(bits(rng)), TARGET_SLOTS)]
+    )
     robot = np.int64(data.robot_moves[robot * 5 + action])
     state[0] = robot
     state[1] = target
@@ -56,7 +79,7 @@ def uniform_rollout(state, action, observation, depth, max_depth, discount, data
     for _ in range(depth, max_depth):
         steps += 1
         word = word + GOLDEN
-        random = mixed(word)
+        random = np.uint64(mixed(word))
         action = _low(random, 5)
         reward = -1.0
         if action == TAG:
@@ -89,7 +112,7 @@ def history_rollout(state, action, observation, depth, max_depth, discount, data
         total -= weight
         weight *= discount
         word = word + GOLDEN
-        random = mixed(word)
+        random = np.uint64(mixed(word))
         target = np.int64(data.target_moves[(robot * CELLS + target) * TARGET_SLOTS + _high(random, TARGET_SLOTS)])
         move = np.int64(data.rollout_moves[(robot * 5 + last) * ROLLOUT_SLOTS + _low(random, ROLLOUT_SLOTS)])
         last = move >> 5
