@@ -84,7 +84,9 @@ def evaluate(
     with Store.create(out) as store:
         experiment = prepare(settings)
         play_missing(experiment, store, play_job, notes, f"tab-marl {shlex.join(sys.argv[1:])}")
-        _present(store, experiment.key, out, settings.replays)
+        from tab_marl.evaluation.present import present
+
+        present(store, store.settings()[0], out, settings.replays, notes)
 
 
 @app.command()
@@ -94,8 +96,12 @@ def report(
     replays: Annotated[int | None, typer.Option(help="Animated replays; default: as evaluated.")] = None,
 ) -> None:
     """Print the tables of stored episodes again and rewrite their report."""
+    from rich.console import Console
+
+    from tab_marl.evaluation.present import present
     from tab_marl.evaluation.store import Store
 
+    notes = Console(stderr=True)
     with Store.open(out) as store:
         known = [s for s in store.settings() if s.rows]
         if not known:
@@ -104,12 +110,102 @@ def report(
         if not matching:
             raise UserError(f"no settings with key {key!r} in {store.path}; known: {', '.join(s.key for s in known)}")
         if key is None and len(known) > 1:
-            print(f"settings {known[0].key} (latest of {len(known)}; --settings chooses another)", file=sys.stderr)
-        _present(store, matching[0].key, store.path.parent, replays)
+            notes.print(
+                f"settings {known[0].key}, the latest of {len(known)}; --settings chooses another", highlight=False
+            )
+        present(store, matching[0], store.path.parent, replays, notes)
 
 
-def _present(store: object, key: str, folder: Path, replays: int | None) -> None:
-    raise NotImplementedError
+@app.command()
+def field(
+    mission: Annotated[str, typer.Argument(help='In English: "Reach Checkpoint A within 16s".')],
+    scenario: Annotated[str, typer.Option(help="Name of a scenario.")] = "lab",
+    preset: Annotated[str, typer.Option(help="default, or paper (the literal field).")] = "default",
+    out: Annotated[Path, typer.Option("--out", "-o", help="PNG of the occupancy over time.")] = Path("field.png"),
+) -> None:
+    """Solve the TAB-Field of a mission, print what it says and draw it."""
+    from tab_marl.evaluation.single import solve_and_draw
+
+    _announce_first_use()
+    print(solve_and_draw(mission, scenario, preset, out))
+
+
+@app.command()
+def watch(
+    mission: Annotated[str, typer.Option(help="M1 to M5, or a mission in English (with --scenario).")] = "M1",
+    family: Annotated[str, typer.Option(help="point, perimeter or ambiguous, on random maps.")] = "ambiguous",
+    scenario: Annotated[str, typer.Option(help="random, or the name of a scenario.")] = "random",
+    planner: Annotated[str, typer.Option(help="Who drives the ego.")] = "TAB-POMCP",
+    adversary: Annotated[str | None, typer.Option(help="Zoo policy; default: the first.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Decides map, starts and noise.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="A .gif, .mp4 or folder of PNGs instead of a window.")
+    ] = None,
+) -> None:
+    """Play one episode and show it, with the planner's belief over the map."""
+    from tab_marl.evaluation.single import watch_episode
+
+    _announce_first_use()
+    print(watch_episode(mission, family, scenario, planner, adversary, seed, out))
+
+
+@app.command()
+def train(
+    style: Annotated[str | None, typer.Option(help="A style by name: direct, ...")] = None,
+    config: Annotated[Path | None, typer.Option(help="TOML file with training settings.")] = None,
+    steps: Annotated[int | None, typer.Option(help="Control steps over all robots.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Of initial weights, tasks and exploration.")] = None,
+    name: Annotated[str | None, typer.Option(help="Of the policy; default: the style's.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder of the run; default: runs/train/NAME.")
+    ] = None,
+) -> None:
+    """Train an adversary policy; the same command continues an interrupted run."""
+    from rich.console import Console
+
+    from tab_marl.evaluation.single import train_policy
+
+    _announce_first_use()
+    train_policy(style, config, {"steps": steps, "seed": seed, "name": name}, out, Console(stderr=True))
+
+
+zoo_app = typer.Typer(help="The trained adversaries that ship with the package.", no_args_is_help=True)
+app.add_typer(zoo_app, name="zoo")
+
+
+@zoo_app.command("list")
+def zoo_list() -> None:
+    """Every policy with its style and success."""
+    from tab_marl.evaluation.single import zoo_table
+
+    zoo_table()
+
+
+@zoo_app.command("show")
+def zoo_show(name: Annotated[str, typer.Argument(help="Name of a policy.")]) -> None:
+    """The card of a policy."""
+    from tab_marl.evaluation.single import zoo_card
+
+    print(zoo_card(name))
+
+
+@zoo_app.command("verify")
+def zoo_verify(
+    episodes: Annotated[int, typer.Option(min=1, help="Held-out tasks per mission type and family.")] = 10,
+    name: Annotated[str | None, typer.Argument(help="Name of a policy; default: all.")] = None,
+) -> None:
+    """Let policies complete held-out missions that nobody hinders; fails if one falls below what its card claims."""
+    from tab_marl.evaluation.single import verify_zoo
+
+    _announce_first_use()
+    raise typer.Exit(0 if verify_zoo(name, episodes) else 1)
+
+
+def _announce_first_use() -> None:
+    from tab_marl.evaluation.evaluate import FIRST_USE, first_use
+
+    if first_use():
+        print(FIRST_USE, file=sys.stderr)
 
 
 def main() -> NoReturn:
@@ -140,8 +236,8 @@ def user_message(error: Exception) -> str | None:
     """One line for an error that the user can mend; None for one that is ours."""
     import sqlite3
 
-    if isinstance(error, UserError):
-        return str(error)
+    if any(kind.__module__.startswith("tab_marl.") for kind in type(error).__mro__):
+        return " ".join(str(error).split())  # every exception that the package defines is written for its users
     if hasattr(error, "format_message"):  # the command line parser's own errors
         return " ".join(str(error.format_message()).split())
     if isinstance(error, OSError):

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tab_marl.agents.planners import EgoAgent, PlannerOptions, make_planner
-from tab_marl.agents.zoo import load_zoo
 from tab_marl.envs.intercept_v0 import parallel_env
 from tab_marl.evaluation.errors import Interrupted
 from tab_marl.evaluation.replay import Trace, shrink
@@ -201,6 +200,8 @@ def _broken(job: Job, planner: str, task: Task | None, error: Exception, seconds
 @lru_cache(maxsize=1)
 def zoo() -> dict[str, Policy]:
     """The shipped policies by name."""
+    from tab_marl.agents.zoo import load_zoo
+
     return {policy.name: policy for policy in load_zoo()}
 
 

@@ -10,12 +10,12 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from tab_marl.evaluation.errors import Interrupted, UserError, require_known
-from tab_marl.evaluation.rows import EpisodeRow
 from tab_marl.evaluation.runner import Play, Result, run
 from tab_marl.evaluation.settings import EvaluationSettings, settings_key
 from tab_marl.evaluation.store import Store
 
 REPORT_NAME = "report.html"
+FIRST_USE = "First use: compiling the numerical kernels takes a minute or two; later runs skip this."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,27 +65,13 @@ def play_missing(experiment: Experiment, store: Store, play: Play, console: Cons
             highlight=False,
         )
     if first_use():
-        console.print(
-            "First use: compiling the numerical kernels takes a minute or two; later runs skip this.", highlight=False
-        )
+        console.print(FIRST_USE, highlight=False)
     try:
         with _progress(console, settings.total, done) as advance:
             run(settings, experiment.adversaries, store, experiment.key, play, advance)
     except Interrupted:
         stored = _count_done(experiment, store)
         raise UserError(f"interrupted: {stored} of {settings.total} episodes are stored; to continue: {hint}") from None
-
-
-def rows_of(settings: EvaluationSettings, store: Store, key: str) -> list[EpisodeRow]:
-    """The stored rows that these settings ask for."""
-    return [
-        row
-        for row in store.rows(key)
-        if row.mission in settings.missions
-        and row.family in settings.families
-        and row.planner in settings.planners
-        and row.seed < settings.episodes
-    ]
 
 
 def first_use() -> bool:

@@ -61,7 +61,7 @@ def _play_traced(job: Job) -> Played:
 def _group(choice: Choice, part: Sequence[tuple[Job, Played]], rows: Mapping[Any, EpisodeRow]) -> dict[str, Any]:
     job, unit = part[0][0], choice.unit
     task = sample_task(np.random.default_rng(unit_seeds(job.base_seed, unit)[0]), unit.mission, unit.family, job.slack)
-    text = to_english(task.mission)
+    text = to_english(task.mission, task.scenario)
     scene = mission_scene(task.mission, task.scenario, text)
     goals = list(dict.fromkeys(region for stage in scene.stages for region in stage.regions))
     episodes = []

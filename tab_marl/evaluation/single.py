@@ -1,0 +1,165 @@
+"""One thing at a time for the command line: a field, an episode, a training run, the zoo."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from tab_marl.evaluation.errors import UserError, require_known
+from tab_marl.world.scenario import Scenario
+
+FILM_STRIDE = 2
+"""Every second control step becomes a frame."""
+
+
+@contextmanager
+def _input() -> Iterator[None]:
+    """Inside, a ValueError speaks of what the user gave."""
+    try:
+        yield
+    except ValueError as error:
+        raise UserError(" ".join(str(error).split())) from error
+
+
+def solve_and_draw(mission: str, scenario: str, preset: str, out: Path) -> str:
+    """Solve the field of a mission in English, draw it to `out`, and say what it says."""
+    from tab_marl.field import FieldOptions, FieldProblem, solve
+    from tab_marl.mission import parse_mission, to_english
+
+    _writable(out)
+    with _input():
+        world = Scenario.preset(scenario)
+        parsed = parse_mission(mission, world)
+        options = FieldOptions.preset(preset)
+        problem = FieldProblem.from_mission(parsed, world, options)
+        field = solve(problem)
+    done = field.completion_probability
+    step = world.step_seconds
+    reached = [int(np.argmax(done >= share - 1e-9)) * step for share in (0.1, 0.5, 0.9)]
+    size = f"{problem.reference.states} states x {len(problem.automaton.delta)} mission states"
+    chance = np.exp(field.log_partition)
+    lines = [
+        f"mission      {to_english(parsed, world)}",
+        f"scenario     {world.name}, {size}, {problem.horizon} ticks of {step:g} s",
+        f"log Z        {field.log_partition:.3f} (unguided motion completes it with probability {chance:.2g})",
+        f"completion   10 % by {reached[0]:g} s, half by {reached[1]:g} s, 90 % by {reached[2]:g} s",
+    ]
+    if len(field.branch_shares) > 1:
+        shares = ", ".join(f"{place} {100 * share:.0f} %" for place, share in field.branch_shares.items())
+        lines.append(f"goes to      {shares}")
+    import matplotlib
+
+    matplotlib.use("Agg")
+    field.plot(out)
+    lines.append(f"picture      {out}")
+    return "\n".join(lines)
+
+
+def watch_episode(
+    mission: str, family: str, scenario: str, planner: str, adversary: str | None, seed: int, out: Path | None
+) -> str:
+    """Play one episode to a window or a file; returns how it ended."""
+    from tab_marl.agents.planners import PLANNERS, make_planner
+    from tab_marl.envs.task_source import task_source
+    from tab_marl.evaluation import film
+    from tab_marl.evaluation.episode import run_episode, zoo, zoo_names
+    from tab_marl.evaluation.replaying import outcome
+    from tab_marl.mission import to_english
+
+    (planner,) = require_known("planner", (planner,), PLANNERS)
+    known = zoo_names()
+    if not known:
+        raise UserError("the zoo holds no adversary: train one with tab-marl train")
+    (name,) = require_known("adversary", (adversary,), known) if adversary else known[:1]
+    if out is None:
+        if not (sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            raise UserError("there is no display to open a window on; write a film with --out episode.gif")
+    else:
+        film.check_target(out)
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+    with _input():
+        task = task_source(None, mission, scenario, family)(np.random.default_rng(seed))
+    agent = make_planner(planner)
+    frames: list[film.Frame] = []
+
+    def on_step(env: Any) -> None:
+        if env.episode.control_steps == 0:
+            env.set_field(agent.belief_image if planner != "random" else None, f"belief of {planner}")
+        if out is not None and (env.episode.control_steps % FILM_STRIDE == 0 or not env.agents):
+            frames.append(env.render())
+
+    played = run_episode(
+        task, agent, zoo()[name], seed, on_step=on_step, render_mode="human" if out is None else "rgb_array"
+    )
+    lines = [
+        f"mission    {to_english(task.mission, task.scenario)}",
+        f"played by  {planner} against {name}, seed {seed}",
+        f"outcome    {outcome(played.row)}",
+    ]
+    if out is not None:
+        count = film.write_film(frames, out, task.scenario.control_hertz // FILM_STRIDE)
+        lines.append(f"film       {out} ({count} frames)")
+    return "\n".join(lines)
+
+
+def train_policy(
+    style: str | None, config: Path | None, changes: Mapping[str, Any], out: Path | None, console: Console
+) -> None:
+    """Train, or continue, a policy with a progress bar; exports it when done."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    from tab_marl.agents.training import Progress as Stand
+    from tab_marl.agents.training import train
+    from tab_marl.agents.training_settings import TrainingSettings
+    from tab_marl.agents.zoo import export_policy
+
+    if style is not None and config is not None:
+        raise UserError("give --style or --config, not both: the file holds a style")
+    with _input():
+        base = (
+            TrainingSettings.from_toml(config) if config is not None else TrainingSettings.for_style(style or "direct")
+        )
+        settings = replace(base, **{name: value for name, value in changes.items() if value is not None})
+    folder = out if out is not None else Path("runs/train") / settings.name
+    with Progress(
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f} %"), TimeElapsedColumn(),
+        TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[note]}"), console=console,
+    ) as bar:  # fmt: skip
+        tasks = bar.add_task("tasks   ", total=settings.tasks, note="")
+        steps = bar.add_task("training", total=settings.steps, note="", start=False)
+
+        def show(stand: Stand) -> None:
+            if stand.phase == "tasks":
+                bar.update(tasks, completed=stand.done, total=stand.total)
+                return
+            bar.start_task(steps)
+            success = " ".join(
+                f"{mission} {100 * share:.0f} %" for mission, share in stand.success.items() if np.isfinite(share)
+            )
+            bar.update(steps, completed=stand.done, note=f"{stand.steps_per_second:.0f} steps/s  {success}")
+
+        try:
+            model = train(settings, folder, show)
+        except KeyboardInterrupt:
+            raise UserError(f"interrupted: the same command continues the run in {folder}") from None
+    path = export_policy(model, settings, folder)
+    console.print(f"policy: {path}; logs: tensorboard --logdir {folder}", highlight=False)
+
+
+def _writable(path: Path) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        existed = path.exists()
+        path.open("ab").close()
+        if not existed:
+            path.unlink()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written: {error.strerror}") from None
