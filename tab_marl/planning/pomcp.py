@@ -170,7 +170,7 @@ class Pomcp:
             allowed = open_actions if allowed is None else np.intersect1d(open_actions, _numbers(actions, allowed))
         root = _root(actions, allowed, prior_values, prior_counts)
         started = time.perf_counter()
-        if isinstance(self.model, CompiledModel) and self.options.compiled and not numba.config.DISABLE_JIT:
+        if isinstance(self.model, CompiledModel) and self.options.compiled and not getattr(numba.config, "DISABLE_JIT", 0):
             tree, simulations, depth, steps = _grow_compiled(self.model, self.options, belief, generator, root)
         else:
             tree, simulations, depth, steps = grow_tree_in_python(self.model, self.options, belief, generator, root)
