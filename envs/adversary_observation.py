@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tab_marl.envs import adversary_kernels as kernels
-from tab_marl.envs.adversary_tables import Parts, Tables, later_windows, pack, zones
+from tab_marl.envs.adversary_tables import LATENT_MAX, Parts, Tables, later_windows, pack, zones
 from tab_marl.envs.styles import SLACK_NEEDED, STRENGTHS, Latents, Style, clearance_cost, styled_cost
 from tab_marl.mission.automaton import COMPLETED, UNBOUNDED, MissionAutomaton
 from tab_marl.mission.compile import compile_mission
@@ -111,9 +111,9 @@ def _build(scenario: Scenario, automaton: MissionAutomaton, latents: Latents, gr
     no_via = np.zeros((0, 2))
     if home < 0 or not _fits(plain, home, home, windows, scenario, 1.0 / SLACK_NEEDED):
         # No time to spare: straight, and as early as possible.
-        return Parts(scenario, automaton, plain, plain, no_via, home, Latents(seed=latents.seed), 0.0)
+        return Parts(scenario, automaton, plain, plain, no_via, home, Latents(seed=latents.seed), 0.0, windows)
     if not latents.bends_route:
-        return Parts(scenario, automaton, plain, plain, no_via, home, latents, 1.0)
+        return Parts(scenario, automaton, plain, plain, no_via, home, latents, 1.0, windows)
     rng = np.random.default_rng(latents.seed + 1)
     dear = {name: float(rng.uniform(0, latents.order_metres)) for name in automaton.branch_places}
     for strength in STRENGTHS:
@@ -129,8 +129,8 @@ def _build(scenario: Scenario, automaton: MissionAutomaton, latents: Latents, gr
         first = route.via_locations[0] if via else home
         if _fits(route, first, home, windows, scenario, TIME_SHARE):
             points = np.asarray(via, dtype=np.float64).reshape(-1, 2)
-            return Parts(scenario, automaton, plain, route, points, home, latents, strength)
-    return Parts(scenario, automaton, plain, plain, no_via, home, latents, 0.0)
+            return Parts(scenario, automaton, plain, route, points, home, latents, strength, windows)
+    return Parts(scenario, automaton, plain, plain, no_via, home, latents, 0.0, windows)
 
 
 def _via_points(
@@ -247,7 +247,7 @@ def observation_bounds() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         low[row], high[row] = -0.5, 2.0
         low[row + 1] = -1.0
     high[[kernels.O_VISIT, kernels.O_LENGTH]] = 2.0
-    high[[kernels.O_LATENTS + 1, kernels.O_LATENTS + 2]] = 10.0
+    high[[kernels.O_LATENTS + 1, kernels.O_LATENTS + 2]] = LATENT_MAX
     low[[kernels.O_EGO + 1, kernels.O_EGO + 2]] = -2.0
     high[[kernels.O_EGO + 1, kernels.O_EGO + 2]] = 2.0
     return low, high

@@ -19,6 +19,8 @@ from tab_marl.world.scenario import Scenario
 
 CAMERA_SHY_SCALE = 6.0
 """What the camera cost is divided by before it is observed."""
+LATENT_MAX = 2.0
+"""Observed latents stop here."""
 
 
 class Tables(NamedTuple):
@@ -73,6 +75,8 @@ class Parts:
     via_home: int
     latents: Latents
     strength: float
+    windows: NDArray[np.int32]
+    """``[U, 2]`` `later_windows`."""
 
 
 def zones(automaton: MissionAutomaton) -> NDArray[np.bool_]:
@@ -99,9 +103,12 @@ def later_windows(automaton: MissionAutomaton, horizon_ticks: int) -> NDArray[np
     own_early = np.where(automaton.patient, 0, own_early)
     after_early, after_late = early[:u].copy(), late[:u].copy()
     for _ in range(u + 1):
+        before = (early.copy(), late.copy())
         after_early = np.where(follows, early, k.UNBOUNDED).min(axis=1)
         after_late = np.where(follows, late, -1).max(axis=1)
         early[:u], late[:u] = np.maximum(own_early, after_early), np.minimum(own_late, after_late)
+        if np.array_equal(before[0], early) and np.array_equal(before[1], late):
+            break
     after_late = np.where(after_late < 0, horizon_ticks, after_late)
     after_early = np.where(after_early >= k.UNBOUNDED, 0, after_early)
     return np.stack([after_early, after_late], axis=1).astype(np.int32)
@@ -176,7 +183,7 @@ def _pack_automaton(part: Parts, pools: dict[str, _Pool], number: NDArray[np.int
         number[k.TABLE_AT] = pools[name].add(getattr(automaton, name), u * labels, automaton)
     for name in ("patient", "earliest", "latest", "speed_limit"):
         number[k.LOCATION_AT] = pools[name].add(getattr(automaton, name), u, automaton)
-    pools["window"].add(later_windows(automaton, horizon), u, automaton)
+    pools["window"].add(part.windows, u, automaton)
     number[k.FORBIDS_AT] = pools["forbids"].add(zones(automaton), u * regions, automaton)
 
 
@@ -223,8 +230,8 @@ def _fill_real(part: Parts, real: NDArray[np.float64]) -> None:
     real[k.VIA_X : k.VIA_X + len(part.via)] = part.via[:, 0]
     real[k.VIA_Y : k.VIA_Y + len(part.via)] = part.via[:, 1]
     real[k.SIDE] = latents.side * part.strength
-    real[k.CAMERA_SHY] = part.strength * latents.camera_shy / CAMERA_SHY_SCALE
-    real[k.EDGE_NOISE] = part.strength * latents.edge_noise
+    real[k.CAMERA_SHY] = min(part.strength * latents.camera_shy / CAMERA_SHY_SCALE, LATENT_MAX)
+    real[k.EDGE_NOISE] = min(part.strength * latents.edge_noise, LATENT_MAX)
     real[k.ARRIVAL_FRACTION] = latents.arrival_fraction
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tab_marl.mission import route_kernels as kernels
-from tab_marl.world.grid import BLOCKED, GridMap
+from tab_marl.world.grid import GridMap
 
 if TYPE_CHECKING:
     from tab_marl.mission.automaton import MissionAutomaton
@@ -210,9 +210,5 @@ def _neighbourhood(grid: GridMap) -> tuple[NDArray[np.int32], NDArray[np.int32]]
 @lru_cache(maxsize=64)
 def nearest_cells(grid: GridMap) -> NDArray[np.int32]:
     """``[rows, columns]``: the nearest free cell of every square of the map, itself where it is free."""
-    nearest = grid.cell_at.astype(np.int32).copy()
-    rows, columns = np.nonzero(nearest == BLOCKED)
-    if len(rows):
-        squares = np.column_stack([columns + 0.5, rows + 0.5]) * grid.cell_metres
-        nearest[rows, columns] = grid.cells_of(squares)
+    nearest: NDArray[np.int32] = kernels.nearest_free(grid.cell_at, grid.centres, grid.cell_metres)
     return nearest

@@ -234,3 +234,22 @@ def look_ahead_many(
             distance, next_cell, max_metres,
         )  # fmt: skip
     return cell, after
+
+
+@njit(cache=True)
+def nearest_free(cell_at, centres, cell_metres):
+    """``[rows, columns]``: the free cell whose centre is nearest to each square's (ties go to the lower number)."""
+    rows, columns = cell_at.shape
+    nearest = np.empty((rows, columns), dtype=np.int32)
+    for r in range(rows):
+        for c in range(columns):
+            nearest[r, c] = cell_at[r, c]
+            if cell_at[r, c] >= 0:
+                continue
+            x, y = (c + 0.5) * cell_metres, (r + 0.5) * cell_metres
+            best = np.inf
+            for s in range(centres.shape[0]):
+                gap = (centres[s, 0] - x) ** 2 + (centres[s, 1] - y) ** 2
+                if gap < best - 1e-12:
+                    nearest[r, c], best = s, gap
+    return nearest

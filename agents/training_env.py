@@ -1,0 +1,121 @@
+"""The batched world as a stable-baselines3 vector environment, and the banks of tasks it draws from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+
+from tab_marl.envs.adversary_observation import AdversaryTask, observation_bounds
+from tab_marl.envs.batched import Bank, BatchedWorld
+from tab_marl.envs.styles import Style
+from tab_marl.mission.tasks import Task, sample_task
+
+TRAINING, HELD_OUT = 1, 2
+"""Streams of tasks that never share a random number."""
+WINDOW = 400
+"""Episodes over which success is averaged for the log."""
+
+
+def draw_tasks(stream: int, seed: int, count: int, missions: Sequence[str], families: Sequence[str]) -> list[Task]:
+    """`count` tasks, missions and families in turn; task i depends on (stream, seed, i) only."""
+    kinds = [(mission, family) for family in families for mission in missions]
+    return [
+        sample_task(np.random.default_rng((stream, seed, i)), *kinds[i % len(kinds)])
+        for i in range(count)
+    ]  # fmt: skip
+
+
+def build_bank(
+    tasks: Sequence[Task], style: Style, seed: int, on_built: Callable[[int, int], None] | None = None
+) -> Bank:
+    """The bank of these tasks, latents drawn from (seed, index)."""
+    built = []
+    for i, task in enumerate(tasks):
+        rng = np.random.default_rng((seed, i))
+        built.append(AdversaryTask.build(task.scenario, task.mission, style, rng))
+        if on_built is not None:
+            on_built(i + 1, len(tasks))
+    return Bank.of(built)
+
+
+class BatchedVecEnv(VecEnv):
+    """N robots that begin a new task of the bank whenever theirs has ended.
+
+    `weights` ``[K]`` (summing to 1) is the probability of each task of the bank.
+    """
+
+    render_mode = None
+
+    def __init__(self, bank: Bank, kinds: Sequence[str], robots: int, seed: int, seen_metres: float = 0.0) -> None:
+        low, high = observation_bounds()
+        super().__init__(robots, Box(low, high, dtype=np.float32), Box(-1.0, 1.0, (2,), np.float32))
+        self.world = BatchedWorld(bank, robots, np.random.default_rng((seed, 7)))
+        self.world.seen_metres = seen_metres
+        self.kinds = tuple(kinds)
+        """Mission type of each task."""
+        self.weights = np.full(len(bank), 1.0 / len(bank))
+        self.returns = np.zeros(robots)
+        self.ticks = np.zeros(robots, dtype=np.int64)
+        self.recent: dict[str, list[float]] = {kind: [] for kind in sorted(set(kinds))}
+        self._action = np.zeros((robots, 2), dtype=np.float32)
+
+    def _begin(self, which: NDArray[np.int64]) -> None:
+        self.world.begin(which, self.world.rng.choice(len(self.weights), size=len(which), p=self.weights))
+
+    def reset(self) -> NDArray[np.float32]:
+        self._begin(np.arange(self.num_envs))
+        self.returns[:] = 0
+        self.ticks[:] = 0
+        return self.world.observation.copy()
+
+    def step_async(self, actions: NDArray[np.float32]) -> None:
+        self._action = actions
+
+    def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+        world = self.world
+        world.step(self._action)
+        reward = world.reward.astype(np.float32)
+        self.returns += world.reward
+        self.ticks += 1
+        done = world.finished
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        ended = np.flatnonzero(done)
+        if len(ended):
+            completed = world.completed
+            for i in ended:
+                infos[i] = {
+                    "terminal_observation": world.observation[i].copy(),
+                    "episode": {"r": float(self.returns[i]), "l": int(self.ticks[i]), "t": 0.0},
+                }
+                recent = self.recent[self.kinds[world.task[i]]]
+                recent.append(float(completed[i]))
+                del recent[:-WINDOW]
+            self.returns[ended] = 0
+            self.ticks[ended] = 0
+            self._begin(ended)
+        return world.observation.copy(), reward, done, infos
+
+    def success(self) -> dict[str, float]:
+        """Share of completed missions per mission type over the last episodes (nan before the first)."""
+        return {kind: float(np.mean(recent)) if recent else float("nan") for kind, recent in self.recent.items()}
+
+    # What VecEnv asks for beside that; there is one world, so no per-robot attributes.
+    def close(self) -> None:
+        pass
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        setattr(self, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        raise AttributeError(f"the batched world has no method {method_name!r} per robot")
+
+    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+        return [False] * len(list(self._get_indices(indices)))
