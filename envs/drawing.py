@@ -22,6 +22,10 @@ Colour = tuple[int, int, int]
 Point = tuple[float, float]
 
 SUPERSAMPLING = 2
+DASH_PIXELS = 13
+"""Length of one dash and gap on a dashed circle, final pixels."""
+DASH_SHARE = 0.58
+"""Of which this share is dash."""
 
 PAPER: Colour = (246, 247, 249)
 FLOOR: Colour = (255, 255, 255)
@@ -72,33 +76,22 @@ class Canvas:
 
     def disc(self, x: float, y: float, radius: float, colour: Colour, alpha: int = 255) -> None:
         """A filled disc; radius in metres."""
-        px, py = self.at(x, y)
-        r = radius * self.scale
-        if alpha == 255:
-            pygame.draw.circle(self.surface, colour, (px, py), r)
-            return
-        side = math.ceil(r) * 2 + 4
-        patch = pygame.Surface((side, side), pygame.SRCALPHA, 32)
-        pygame.draw.circle(patch, (*colour, alpha), (side / 2 + px % 1, side / 2 + py % 1), r)
-        self.surface.blit(patch, (math.floor(px) - side // 2, math.floor(py) - side // 2))
+        self._stamp(x, y, _round_patch(round(radius * self.scale, 1), None, 0, colour, alpha))
 
     def ring(self, x: float, y: float, radius: float, colour: Colour, width: float, alpha: int = 255) -> None:
         """A circle's outline; width in final pixels, drawn inwards."""
-        px, py = self.at(x, y)
-        r = radius * self.scale
-        side = math.ceil(r) * 2 + 4
-        patch = pygame.Surface((side, side), pygame.SRCALPHA, 32)
-        centre = (side / 2 + px % 1, side / 2 + py % 1)
-        pygame.draw.circle(patch, (*colour, alpha), centre, r)
-        pygame.draw.circle(patch, (*colour, 0), centre, r - width * SUPERSAMPLING)
-        self.surface.blit(patch, (math.floor(px) - side // 2, math.floor(py) - side // 2))
+        self._stamp(x, y, _round_patch(round(radius * self.scale, 1), width * SUPERSAMPLING, 0, colour, alpha))
 
     def dashes(self, x: float, y: float, radius: float, colour: Colour, width: float, alpha: int = 255) -> None:
-        """A dashed circle."""
-        count = max(12, int(radius * self.scale / 14))
-        for i in range(count):
-            turn = np.linspace(i, i + 0.55, 7) * (2 * math.pi / count)
-            self.line(np.column_stack([x + radius * np.cos(turn), y + radius * np.sin(turn)]), colour, width, alpha)
+        """A dashed circle; width in final pixels, drawn inwards."""
+        pixels = round(radius * self.scale, 1)
+        count = max(12, round(2 * math.pi * pixels / (DASH_PIXELS * SUPERSAMPLING)))
+        self._stamp(x, y, _round_patch(pixels, width * SUPERSAMPLING, count, colour, alpha))
+
+    def _stamp(self, x: float, y: float, patch: pygame.Surface) -> None:
+        px, py = self.at(x, y)
+        half = patch.get_width() / 2
+        self.surface.blit(patch, (round(px - half), round(py - half)))
 
     def line(self, points: NDArray[np.float64], colour: Colour, width: float, alpha: int = 255) -> None:
         """A polyline ``[N, 2]`` with round joints; width in final pixels."""
@@ -173,6 +166,27 @@ class Canvas:
         return pygame.transform.smoothscale(self.surface, size)
 
 
+@lru_cache(maxsize=256)
+def _round_patch(radius: float, width: float | None, dashes: int, colour: Colour, alpha: int) -> pygame.Surface:
+    """A disc (width None) or a ring of so many dashes (0: unbroken), in pixels, with soft edges."""
+    side = 2 * math.ceil(radius + 1)
+    offset = np.arange(side) + 0.5 - side / 2
+    distance = np.hypot(offset[:, None], offset[None, :])
+    cover = np.clip(radius + 0.5 - distance, 0.0, 1.0)
+    if width is not None:
+        cover *= np.clip(distance - (radius - width) + 0.5, 0.0, 1.0)
+    if dashes:
+        turn = np.arctan2(offset[None, :], offset[:, None]) * dashes / (2 * math.pi) % 1.0
+        along = 2 * math.pi * radius / dashes  # pixels of one dash and gap
+        cover *= np.clip((DASH_SHARE / 2 - np.abs(turn - 0.5)) * along + 0.5, 0.0, 1.0)
+    patch = pygame.Surface((side, side), pygame.SRCALPHA, 32)
+    patch.fill((*colour, 0))
+    opacity = pygame.surfarray.pixels_alpha(patch)
+    opacity[:] = np.round(alpha * cover).astype(np.uint8)
+    del opacity  # unlocks the surface
+    return patch
+
+
 def _thick_segment(
     surface: pygame.Surface, paint: tuple[int, int, int, int], start: Point, end: Point, thick: int
 ) -> None:
@@ -204,12 +218,8 @@ def write(
     halo: Colour | None = None,
 ) -> pygame.Rect:
     """Set a line of text; `anchor` names the point of its rectangle (pygame's names). A halo keeps it legible on a map."""
-    image = _set(text, size, colour, bold)
+    image = _set(text, size, colour, bold, halo)
     place = image.get_rect(**{anchor: (round(at[0]), round(at[1]))})
-    if halo is not None:
-        behind = _set(text, size, halo, bold)
-        for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (1, 1), (-1, 1), (1, -1)):
-            surface.blit(behind, place.move(dx, dy))
     surface.blit(image, place)
     return place
 
@@ -228,8 +238,20 @@ def wrapped(text: str, width: int, size: int, bold: bool = False) -> list[str]:
 
 
 @lru_cache(maxsize=1024)
-def _set(text: str, size: int, colour: Colour, bold: bool) -> pygame.Surface:
-    return _font(size, bold).render(text, True, colour)
+def _set(text: str, size: int, colour: Colour, bold: bool, halo: Colour | None) -> pygame.Surface:
+    font = _font(size, bold)
+    letters = font.render(text, True, colour)
+    if halo is None:
+        return letters
+    width = max(1, size // 12)
+    image = pygame.Surface((letters.get_width() + 2 * width, letters.get_height() + 2 * width), pygame.SRCALPHA, 32)
+    image.fill((*halo, 0))
+    behind = font.render(text, True, halo)
+    for dx in range(2 * width + 1):
+        for dy in range(2 * width + 1):
+            image.blit(behind, (dx, dy))
+    image.blit(letters, (width, width))
+    return image
 
 
 @lru_cache(maxsize=64)

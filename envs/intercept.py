@@ -44,7 +44,7 @@ Infos = dict[str, dict[str, Any]]
 class InterceptEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
     """An ego that must intercept an adversary with a mission. See the module's and `__init__`'s descriptions."""
 
-    metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]
+    metadata: ClassVar[dict[str, Any]] = {
         "name": "tab_marl_intercept_v0",
         "render_modes": list(RENDER_MODES),
         "render_fps": 10,
@@ -88,12 +88,12 @@ class InterceptEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
         self._rng = np.random.default_rng()
         self._view: LiveView | None = None
         self._show_lidar = show_lidar
-        self._heat: HeatSource = heat_source(None, None)
         self._heat_label = "belief"
         self._episode: Episode | None = None
         self._over = False
         # The spaces come from a first task, drawn from a generator of its own so that episodes do not depend on it.
         self._shape_of = self._source(np.random.default_rng(0)).scenario
+        self._heat: HeatSource = heat_source(None, self._shape_of)
         self.observation_spaces = {EGO_AGENT: ego_space(self._shape_of), ADVERSARY_AGENT: adversary_space()}
         self.action_spaces = {agent: Box(-1.0, 1.0, (2,), dtype=np.float32) for agent in AGENTS}
         self.state_space = box_of(_state_rows(self._shape_of))
@@ -120,9 +120,7 @@ class InterceptEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
     def action_space(self, agent: str) -> Box:
         return self.action_spaces[agent]
 
-    def reset(
-        self, seed: int | None = None, options: Mapping[str, Any] | None = None
-    ) -> tuple[Observations, Infos]:
+    def reset(self, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Observations, Infos]:
         """Begin an episode. `options` may hold "task" (a Task), "ego_start" and "adversary_start" (x, y, theta);
         other keys are ignored. The same seed, options and actions give the same episode.
         """
@@ -228,7 +226,9 @@ class InterceptEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
     def _start_view(self) -> None:
         if self._view is not None:
             task = self.task
-            self._view.start(task.scenario, mission_scene(task.mission, task.scenario, to_english(task.mission)))
+            self._view.start(
+                task.scenario, mission_scene(task.mission, task.scenario, to_english(task.mission, task.scenario))
+            )
 
     def _observe(self) -> Observations:
         episode = self.episode

@@ -24,8 +24,7 @@ def free_distance(x, y, dx, dy, longest, discs, edges):
         inside = along * along - outside
         if along > 0.0 and inside >= 0.0:
             hit = along - math.sqrt(inside)
-            if hit < nearest:
-                nearest = hit
+            nearest = min(nearest, hit)
     for i in range(edges.shape[0]):
         ax, ay = edges[i, 0] - x, edges[i, 1] - y
         ex, ey = edges[i, 2] - edges[i, 0], edges[i, 3] - edges[i, 1]

@@ -73,5 +73,3 @@ class LiveView:
         if self._renderer is None:
             raise RuntimeError("nothing to draw yet: call reset first")
         return self._renderer
-
-

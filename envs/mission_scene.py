@@ -33,9 +33,12 @@ class MissionScene:
 def mission_scene(mission: Mission, scenario: Scenario, text: str) -> MissionScene:
     """The scene of a mission whose English is `text`."""
     stages = tuple(
-        Stage(_stage_text(goal), tuple(_region(p, scenario) for p in goal.places), goal.visits) for goal in mission.goals
+        Stage(_stage_text(goal), tuple(_region(p, scenario) for p in goal.places), goal.visits)
+        for goal in mission.goals
     )
-    forbidden = [p for c in mission.beside if c.avoid for p in c.places] + [p for g in mission.goals for p in g.restricted]
+    forbidden = [p for c in mission.beside if c.avoid for p in c.places] + [
+        p for g in mission.goals for p in g.restricted
+    ]
     return MissionScene(text, stages, tuple(_region(p, scenario) for p in dict.fromkeys(forbidden)))
 
 

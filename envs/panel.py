@@ -134,7 +134,13 @@ def _sensors(picture: pygame.Surface, x: int, y: int, width: int, scenario: Scen
 
 
 def _legend(
-    picture: pygame.Surface, x: int, bottom: int, width: int, scenario: Scenario, scene: MissionScene | None, frame: Frame
+    picture: pygame.Surface,
+    x: int,
+    bottom: int,
+    width: int,
+    scenario: Scenario,
+    scene: MissionScene | None,
+    frame: Frame,
 ) -> None:
     entries: list[tuple[str, d.Colour, str]] = [
         ("ego", d.EGO, "disc"),

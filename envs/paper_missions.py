@@ -12,12 +12,13 @@ from functools import lru_cache
 
 import numpy as np
 
-from tab_marl.mission import Constraint, Mission, MissionAutomaton, compile_mission, parse_mission
+from tab_marl.mission import Constraint, MissionAutomaton, compile_mission, parse_mission
 from tab_marl.mission.automaton import COMPLETED, UNBOUNDED
 from tab_marl.mission.library import MISSIONS
 from tab_marl.mission.route import solve_route
 from tab_marl.mission.tasks import PURSUIT_SECONDS, TURN_SECONDS, Task
 from tab_marl.world.grid import GridMap
+from tab_marl.world.regions import Region
 from tab_marl.world.scenario import Scenario, UnknownName
 
 SLACK = 1.5
@@ -48,7 +49,7 @@ def paper_mission(mission_id: str, scenario: Scenario) -> Task:
 def open_point(scenario: Scenario) -> tuple[float, float]:
     """A target for "target [x, y]": the free point farthest from checkpoints, central zone and the robots' starts."""
     grid = GridMap.from_scenario(scenario, CELL_METRES)
-    regions = [c.region for c in scenario.checkpoints]
+    regions: list[Region] = [c.region for c in scenario.checkpoints]
     regions += [scenario.region("central zone"), scenario.adversary_start, scenario.ego_start]
     room = np.min([region.distance(grid.centres) for region in regions], axis=0)
     margin = scenario.target_radius_metres + TARGET_MARGIN_METRES
@@ -68,7 +69,9 @@ def _shortest_way(automaton: MissionAutomaton, scenario: Scenario, mission_id: s
     route = solve_route(automaton, GridMap.from_scenario(scenario, CELL_METRES))
     cells, locations = route.path(max(home, 0), start)
     if home < 0 or len(cells) < 2 or locations[-1] != COMPLETED:
-        raise ValueError(f"scenario {scenario.name!r}: no way from the adversary's start completes mission {mission_id!r}")
+        raise ValueError(
+            f"scenario {scenario.name!r}: no way from the adversary's start completes mission {mission_id!r}"
+        )
     points = route.grid.centres[cells]
     seconds = np.hypot(*np.diff(points, axis=0).T) / scenario.adversary.max_speed
     counted = automaton.progress[locations[:-1], automaton.masks(points[1:])] & (locations[1:] != locations[:-1])

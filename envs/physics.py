@@ -38,12 +38,18 @@ STRAIGHT_TURN_RATE = 1e-6
 
 _ROBOT_TYPES, _SOLID_TYPE = (1, 2), 3
 
-# Bound property functions: pymunk runs a Python __setattr__ on every assignment, and these skip it.
-_get_position, _set_position = Body.position.fget, Body.position.fset
-_get_angle, _set_angle = Body.angle.fget, Body.angle.fset
-_get_velocity, _set_velocity = Body.velocity.fget, Body.velocity.fset
-_set_turn_rate = Body.angular_velocity.fset
-_set_anchor = PivotJoint.anchor_a.fset
+
+def _accessors(owner: type, name: str) -> tuple[Any, Any]:
+    """A property's own functions: pymunk runs a Python __setattr__ on every assignment, and these skip it."""
+    accessor: property = vars(owner)[name]
+    return accessor.fget, accessor.fset
+
+
+_get_position, _ = _accessors(Body, "position")
+_get_angle, _set_angle = _accessors(Body, "angle")
+_get_velocity, _set_velocity = _accessors(Body, "velocity")
+_, _set_turn_rate = _accessors(Body, "angular_velocity")
+_, _set_anchor = _accessors(PivotJoint, "anchor_a")
 
 
 class Motion(NamedTuple):

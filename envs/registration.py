@@ -24,4 +24,4 @@ def register_all() -> None:
     registries = {"parallel": pettingzoo.parallel_registry, "aec": pettingzoo.aec_registry}
     for kind, entry_point in PETTINGZOO_ENTRY_POINTS.items():
         if PETTINGZOO_ID not in registries[kind]:
-            pettingzoo.register(kind, PETTINGZOO_ID, entry_point)  # type: ignore[call-overload]
+            pettingzoo.register(kind, PETTINGZOO_ID, entry_point)

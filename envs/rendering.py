@@ -72,6 +72,10 @@ class Renderer:
         self.scene = scene
         longest = max(scenario.width_metres, scenario.height_metres)
         self._canvas = d.Canvas(scenario.width_metres, scenario.height_metres, MAP_PIXELS / longest, MARGIN_PIXELS)
+        known = [region for _, region in scenario.named_regions()]
+        places = [] if scene is None else [region for stage in scene.stages for region in stage.regions]
+        self._unnamed = tuple(dict.fromkeys(place for place in places if place not in known))
+        """Bare target points of the mission."""
         self._base = self._draw_map()
         map_width, map_height = (side // d.SUPERSAMPLING for side in self._base.get_size())
         self.size = (map_width + PANEL_PIXELS, max(map_height, MAP_PIXELS + 2 * MARGIN_PIXELS))
@@ -99,6 +103,8 @@ class Renderer:
         picture.blit(scaled, (0, self._map_top))
         if frame.intercepted:
             self._write_banner(picture, f"Intercepted at {frame.seconds:.1f} s", d.EGO)
+        elif frame.over and frame.completed_seconds is not None:
+            self._write_banner(picture, f"Mission completed at {frame.completed_seconds:.1f} s", d.ADVERSARY)
         elif frame.over:
             self._write_banner(picture, f"Not intercepted in {frame.seconds:.1f} s", d.ADVERSARY)
         draw_panel(picture, self.size[0] - PANEL_PIXELS, PANEL_PIXELS, self.scenario, self.scene, frame)
@@ -106,7 +112,10 @@ class Renderer:
 
     def array(self, frame: Frame) -> NDArray[np.uint8]:
         """The picture as ``[height, width, 3]``."""
-        return np.ascontiguousarray(pygame.surfarray.array3d(self.draw(frame)).swapaxes(0, 1))
+        picture = self.draw(frame)
+        width, height = picture.get_size()
+        pixels = np.frombuffer(pygame.image.tobytes(picture, "RGB"), dtype=np.uint8)
+        return pixels.reshape(height, width, 3).copy()  # the buffer is read-only
 
     def _draw_map(self) -> pygame.Surface:
         """What never changes: the floor, its grid and the frame."""
@@ -149,6 +158,9 @@ class Renderer:
         for checkpoint in scenario.checkpoints:
             if checkpoint.region not in goals:
                 canvas.region(checkpoint.region, d.MUTED, 26, 1.5, 160)
+        for place in self._unnamed:
+            if place not in goals:
+                canvas.region(place, d.MUTED, 26, 1.5, 160)
         for goal in goals:
             canvas.region(goal, d.GOAL, 46, 2.5)
 
@@ -200,8 +212,7 @@ class Renderer:
     def _write_names(self, frame: Frame) -> None:
         canvas, goals = self._canvas, self._goals(frame)
         named = [(c.name, c.region) for c in self.scenario.checkpoints] + list(self.scenario.regions)
-        known = {region for _, region in self.scenario.named_regions()}
-        named += [("target", goal) for goal in goals if goal not in known]
+        named += [("target", place) for place in self._unnamed]
         for name, region in named:
             bold = region in goals
             px, py = canvas.at(region.centre[0], region.bounds()[1])

@@ -7,10 +7,11 @@ are those of `InterceptEnv` for that side; by default an episode ends with the m
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import gymnasium
 import numpy as np
+from gymnasium.spaces import Space
 from numpy.typing import NDArray
 
 from tab_marl.envs.intercept import ADVERSARY_AGENT, EGO_AGENT, RENDER_MODES, InterceptEnv
@@ -25,7 +26,12 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # type: ignore[misc]
 
     def __init__(
-        self, side: str, opponent: Opponent, render_mode: str | None = None, end_on_completion: bool = True, **arguments: Any
+        self,
+        side: str,
+        opponent: Opponent,
+        render_mode: str | None = None,
+        end_on_completion: bool = True,
+        **arguments: Any,
     ) -> None:
         """`side`: "ego" or "adversary", who learns. `opponent` plays the other side (see `opponents`); an adversary with a
         `style` brings it along. Further arguments go to `InterceptEnv`.
@@ -41,8 +47,8 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.inner = InterceptEnv(render_mode=render_mode, end_on_completion=end_on_completion, **arguments)
         """The environment of both sides."""
         self.render_mode = render_mode
-        self.observation_space = self.inner.observation_space(self._own)
-        self.action_space = self.inner.action_space(self._own)
+        self.observation_space = cast(Space[NDArray[np.float32]], self.inner.observation_space(self._own))
+        self.action_space = cast(Space[NDArray[np.float32]], self.inner.action_space(self._own))
         self._seen_by_other: NDArray[np.float32] | None = None
 
     def reset(
@@ -57,19 +63,19 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._seen_by_other = observations[self._other]
         return observations[self._own], infos[self._own]
 
-    def step(
-        self, action: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Advance by one control step; the opponent acts on its own observation of the same moment."""
         if self._seen_by_other is None:
             raise RuntimeError("there is no episode yet: call reset first")
         other = self._opponent.act(self._seen_by_other)
-        observations, rewards, terminations, truncations, infos = self.inner.step({self._own: action, self._other: other})
+        observations, rewards, terminations, truncations, infos = self.inner.step(
+            {self._own: action, self._other: other}
+        )
         self._seen_by_other = observations[self._other]
         own = self._own
         return observations[own], rewards[own], terminations[own], truncations[own], infos[own]
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """See `InterceptEnv.render`."""
         return self.inner.render()
 
