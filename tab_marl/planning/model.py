@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
@@ -62,8 +62,9 @@ class CompiledModel:
         if self.state_size < 1:
             raise ValueError(f"state_size is {self.state_size}, must be >= 1")
 
+    @cached_property
     def functions(self) -> tuple[Any, Any, Any]:
-        """step, rollout and prior compiled for this type of data (remembered; rollout and prior may be None)."""
+        """step, rollout and prior compiled for this type of data (rollout and prior may be None)."""
         data = typeof(self.data)
         step = _compiled(_plain(self.step), _STEP_RESULT(_STATE, types.int64, data, _RNG))
         rollout = prior = None

@@ -244,7 +244,7 @@ def _grow_compiled(
     model: CompiledModel, options: PomcpOptions, belief: Any, rng: np.random.Generator, root: Root
 ) -> tuple[SearchTree, int, int, int]:
     states, weights = belief_states(model, belief, options.simulations, rng)
-    step, rollout, prior = model.functions()
+    step, rollout, prior = model.functions
     actions, horizon = model.actions, options.horizon
     tree_stream = rng.integers(2**64, size=1, dtype=np.uint64)
     model_stream = rng.integers(2**64, size=1, dtype=np.uint64)

@@ -34,21 +34,27 @@ class PursuitOptions:
     """How far ahead paths are sampled, at most (they end with the episode)."""
     candidates: int = 12
     """The best routes that the tree may choose among, now and later."""
-    simulations: int = 1500
-    exploration: float = 10.0
+    simulations: int = 600
+    exploration: float = 5.0
     """UCB1's constant, in units of return."""
     macro_seconds: float = 1.0
     """How long a route is kept in the tree, unless cameras begin or cease to see the adversary."""
-    tree_seconds: float = 8.0
+    tree_seconds: float = 6.0
     """Route changes later than this are not searched."""
     root_count: int = 10
     """Pseudo-count of a route's value at the root."""
-    node_count: int = 1
+    node_count: int = 5
     """Pseudo-count of a route's value below the root."""
-    keep_count: int = 3
-    """The same for keeping the route."""
+    keep_count: int = 0
+    """The same for keeping the route; 0: it is tried first, and its value is what its rollouts say."""
     square_metres: float = 0.4
     """A sighting in the tree is told by the square of this size in which it is."""
+    switches: int = 3
+    """In a rollout the route is changed at most so often, when a camera sees the adversary; 0: never."""
+    alike_metres: float = 0.4
+    """Sampled paths this near to a sighting tell what the sighting means."""
+    switch_bonus: float = 2.0
+    """By how much another route must look better before a rollout leaves its own."""
     keep_bonus: float = 0.5
     """By how much another route must be better before the present one is left."""
     radius_share: float = 1.0
@@ -57,13 +63,13 @@ class PursuitOptions:
     def __post_init__(self) -> None:
         if self.method not in ("tree", "routes"):
             raise ValueError(f"PursuitOptions.method is {self.method!r}, must be 'tree' or 'routes'")
-        for name in ("paths", "candidates", "simulations", "root_count", "node_count", "keep_count"):
+        for name in ("paths", "candidates", "simulations", "root_count", "node_count"):
             if getattr(self, name) < 1:
                 raise ValueError(f"PursuitOptions.{name} is {getattr(self, name)}, must be >= 1")
-        for name in ("horizon_seconds", "macro_seconds", "square_metres", "radius_share"):
+        for name in ("horizon_seconds", "macro_seconds", "square_metres", "radius_share", "alike_metres"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"PursuitOptions.{name} is {getattr(self, name)}, must be > 0")
-        for name in ("exploration", "keep_bonus", "tree_seconds"):
+        for name in ("exploration", "keep_bonus", "keep_count", "tree_seconds", "switches", "switch_bonus"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"PursuitOptions.{name} is {getattr(self, name)}, must be >= 0")
 
@@ -77,6 +83,17 @@ class Geometry(NamedTuple):
     aims: NDArray[np.int32]
     goals: NDArray[np.int32]
     waypoints: NDArray[np.float64]
+
+
+class Contacts(NamedTuple):
+    """When sampled paths come by the candidates' waypoints."""
+
+    distances: NDArray[np.float64]
+    """``[W, S]`` metres from every cell to every waypoint."""
+    first: NDArray[np.float64]
+    """``[m, K]`` first tick within meeting distance, inf if never."""
+    last: NDArray[np.float64]
+    """``[m, K]`` last such tick, -1 if never."""
 
 
 class PursuitData(NamedTuple):
@@ -99,8 +116,10 @@ class PursuitData(NamedTuple):
     """``[m, K]`` return of each candidate against each path."""
     baseline: NDArray[np.float64]
     """``[m]`` their means."""
-    search: tuple[float, float, float, float, float, float]
-    """Meeting radius, square, closing per tick, ticks of a macro-action, pseudo-counts of any route and of keeping on."""
+    search: tuple[float, float, float, float, float, float, float, float, float]
+    """Meeting radius, square, closing per tick, ticks of a macro-action, pseudo-counts of any route and of keeping on,
+    distance of paths that look alike, switches in a rollout, what a switch must gain."""
+    contacts: Contacts
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,16 +137,26 @@ class Decision:
 
 
 def pursuit_model(
-    routes: RouteMap, sampled: SampledPaths, values: RouteValues, candidates: NDArray[np.int64], options: PursuitOptions
+    routes: RouteMap,
+    pose: Pose,
+    sampled: SampledPaths,
+    values: RouteValues,
+    candidates: NDArray[np.int64],
+    options: PursuitOptions,
 ) -> CompiledModel:
-    """The pursuit from now on, over these candidate routes."""
+    """The pursuit from a pose on, over these candidate routes."""
     scenario, step = routes.scenario, routes.scenario.step_seconds
     paths = np.ascontiguousarray(sampled.positions, dtype=np.float64)
     closing = interception_kernels.largest_step(paths) + scenario.ego.max_speed * step + 1e-6
     open_loop = np.ascontiguousarray(values.returns[candidates])
+    radius = scenario.interception_metres * options.radius_share
+    completed = np.ascontiguousarray(sampled.completed_tick, dtype=np.int32)
+    points = np.concatenate([routes.waypoints, [pose[:2]]])[candidates]
+    first, last = np.empty((2, len(candidates), len(paths)))
+    pursuit_kernels.contacts(paths, completed, points, radius, first, last)
     data = PursuitData(
         paths,
-        np.ascontiguousarray(sampled.completed_tick, dtype=np.int32),
+        completed,
         np.array([(c.x, c.y, c.camera_metres) for c in scenario.checkpoints], dtype=np.float64).reshape(-1, 3),
         Geometry(
             routes.nearest, routes.grid.cell_metres, routes.grid.centres, routes.aims, routes.goals, routes.waypoints
@@ -144,13 +173,31 @@ def pursuit_model(
         open_loop,
         open_loop.mean(axis=1, dtype=np.float64),
         (
-            scenario.interception_metres * options.radius_share, options.square_metres, closing,
-            float(max(1, round(options.macro_seconds / step))), float(options.node_count), float(options.keep_count),
+            radius, options.square_metres, closing, float(max(1, round(options.macro_seconds / step))),
+            float(options.node_count), float(options.keep_count), options.alike_metres, float(options.switches),
+            options.switch_bonus,
         ),
+        Contacts(routes.distances, first, last),
     )  # fmt: skip
     return CompiledModel(
         pursuit_kernels.step, len(candidates), 5, data, rollout=pursuit_kernels.rollout, prior=pursuit_kernels.prior
     )
+
+
+def choose_candidates(
+    returns: NDArray[np.float32], mean: NDArray[np.float64], count: int, current: int | None
+) -> NDArray[np.int64]:
+    """``[count]`` routes, the best first: half of them best on average, half each best for paths that the others miss."""
+    chosen = list(np.argsort(-mean, kind="stable")[: (count + 1) // 2])
+    if current is not None and current not in chosen:
+        chosen.append(current)
+    covered = returns[chosen].max(axis=0)
+    while len(chosen) < count:
+        gain = np.maximum(returns, covered).sum(axis=1, dtype=np.float64)
+        gain[chosen] = -np.inf
+        chosen.append(int(np.argmax(gain)))
+        covered = np.maximum(covered, returns[chosen[-1]])
+    return np.array(chosen[:count], dtype=np.int64)
 
 
 def decide(
@@ -169,13 +216,11 @@ def decide(
     mean = values.mean
     if current is not None:
         mean[current] += options.keep_bonus
-    count = min(options.candidates, len(mean))
-    best = np.argsort(-mean, kind="stable")[:count].astype(np.int64)
-    if current is not None and current not in best:
-        best[-1] = current
+    best = choose_candidates(values.returns, mean, min(options.candidates, len(mean)), current)
+    count = len(best)
     if options.method == "routes" or count == 1:
         return Decision(int(best[0]), values, best, None)
-    model = pursuit_model(routes, sampled, values, best, options)
+    model = pursuit_model(routes, pose, sampled, values, best, options)
     macro = max(1, round(options.macro_seconds / scenario.step_seconds))
     search = PomcpOptions(
         simulations=options.simulations,

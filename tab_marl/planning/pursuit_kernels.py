@@ -2,12 +2,16 @@
 
 Arrays and scalars only; nothing here validates or raises. `data` is the tuple `pursuit.PursuitData`. A state is
 ``[path number, tick, x, y, theta]``.
+
+What a sighting tells is estimated from the sampled paths themselves: those that are near the seen point at that tick
+are what the adversary may be doing, and each route is judged by how many of them it reaches ahead of time (`prospects`).
 """
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit
 
 from tab_marl.planning.interception_kernels import meeting_fraction
@@ -16,6 +20,8 @@ from tab_marl.world.kernels import unicycle_step
 
 UNSEEN = 0
 ENDED = -1
+TURN_TICKS = 2.0
+"""Allowed for turning when a route's arrival is estimated."""
 
 
 @njit(cache=True)
@@ -61,7 +67,7 @@ def pursue(state, route, ticks, data):
 
     Returns (observation, reward, whether the scenario ended).
     """
-    paths, completed, cameras, geometry, robot, prices, _candidates, _open_loop, _baseline, search = data
+    paths, completed, cameras, geometry, robot, prices, _candidates, _open_loop, _baseline, search, _ways = data
     met, per_tick, per_effort, mission_completed = prices
     radius, square = search[0], search[1]
     k, t = int(state[0]), int(state[1])
@@ -93,7 +99,7 @@ def pursue(state, route, ticks, data):
 @njit(cache=True)
 def wait_for(state, route, data):
     """The return of driving a route to its end and waiting there, from a state on."""
-    paths, completed, _cameras, geometry, robot, prices, _candidates, _open_loop, _baseline, search = data
+    paths, completed, _cameras, geometry, robot, prices, _candidates, _open_loop, _baseline, search, _ways = data
     met, per_tick, per_effort, mission_completed = prices
     radius, closing = search[0], search[2]
     k, t = int(state[0]), int(state[1])
@@ -127,6 +133,72 @@ def wait_for(state, route, data):
     return reward + (mission_completed if ends else 0.0)
 
 
+@njit(cache=True)
+def prospects(state, alike_metres, leave_out, data, values):
+    """Fill `values` ``[m]``: what driving each candidate route from here is worth against the paths that look alike now.
+
+    A path looks alike if it is within `alike_metres` of the state's path at this tick, or if both are unseen. Meetings
+    count at the waypoint only: the ego arrives by the geodesic distance and a turn, and the path must still come by.
+    `leave_out` leaves the state's own path out, so that a choice made by these values is blind to it.
+    Returns how many paths were alike; `values` is untouched if none was.
+    """
+    paths, completed, cameras, geometry, robot, prices, candidates, _open_loop, _baseline, search, ways = data
+    met, per_tick, _per_effort, mission_completed = prices
+    distances, first_contact, last_contact = ways
+    nearest, cell_metres = geometry[0], geometry[1]
+    reach = robot[0] * robot[2] * robot[3]
+    k, t = int(state[0]), int(state[1])
+    here_x, here_y = paths[k, t, 0], paths[k, t, 1]
+    visible = sight_code(here_x, here_y, cameras, search[1]) != UNSEEN
+    r = min(max(int(state[3] / cell_metres), 0), nearest.shape[0] - 1)
+    c = min(max(int(state[2] / cell_metres), 0), nearest.shape[1] - 1)
+    cell = nearest[r, c]
+    alike = 0
+    for j in range(paths.shape[0]):
+        if leave_out and j == k:
+            continue
+        last, ends = last_tick(completed[j], paths.shape[1] - 1)
+        if last <= t:
+            continue
+        if visible:
+            dx, dy = paths[j, t, 0] - here_x, paths[j, t, 1] - here_y
+            if dx * dx + dy * dy > alike_metres * alike_metres:
+                continue
+        elif sight_code(paths[j, t, 0], paths[j, t, 1], cameras, search[1]) != UNSEEN:
+            continue
+        if alike == 0:
+            values[:] = 0.0
+        alike += 1
+        for a in range(candidates.shape[0]):
+            route = candidates[a]
+            travel = 0.0 if route == distances.shape[0] else distances[route, cell] / reach + TURN_TICKS
+            arrival = max(t + travel, first_contact[a, j])
+            if last_contact[a, j] >= arrival:
+                values[a] += met + per_tick * (arrival - t)
+            else:
+                values[a] += per_tick * (last - t) + (mission_completed if ends else 0.0)
+    if alike > 0:
+        values /= alike
+    return alike
+
+
+@njit(cache=True)
+def contacts(paths, completed, points, radius, first, last):
+    """Fill ``[m, K]``: the first and last tick at which each path is within `radius` of each point, before it ends; inf
+    and -1 if never.
+    """
+    for a in range(points.shape[0]):
+        for k in range(paths.shape[0]):
+            first[a, k], last[a, k] = np.inf, -1.0
+            end, _ends = last_tick(completed[k], paths.shape[1] - 1)
+            for t in range(end + 1):
+                dx, dy = paths[k, t, 0] - points[a, 0], paths[k, t, 1] - points[a, 1]
+                if dx * dx + dy * dy <= radius * radius:
+                    if last[a, k] < 0.0:
+                        first[a, k] = t
+                    last[a, k] = t
+
+
 def step(state, action, data, _rng):
     """POMCP's generative step: one macro-action.
 
@@ -134,7 +206,7 @@ def step(state, action, data, _rng):
     simulation that never changes its route returns exactly the route's mean over all paths, and the search only
     measures what changing routes later is worth.
     """
-    _paths, _completed, _cameras, _geometry, _robot, _prices, candidates, open_loop, baseline, search = data
+    candidates, open_loop, baseline, search = data[6], data[7], data[8], data[9]
     extra = 0.0
     if state[1] == 0.0:
         extra = baseline[action] - open_loop[action, int(state[0])]
@@ -142,15 +214,35 @@ def step(state, action, data, _rng):
     return observation, reward + extra, over
 
 
-def rollout(state, action, _observation, _depth, _max_depth, _discount, data, _rng):
-    """The leaf: go on along the last route and wait at its end."""
-    return wait_for(state, data[6][action], data)
+def rollout(state, action, observation, _depth, _max_depth, _discount, data, _rng):
+    """The leaf: go on along the last route; when a camera sees the adversary, take the route that then looks best.
+
+    The choice is made by the other paths that look alike, so it knows no more than the ego will.
+    """
+    candidates, search = data[6], data[9]
+    values = np.empty(candidates.shape[0])
+    route, total = action, 0.0
+    for _ in range(int(search[7])):
+        if observation != UNSEEN and prospects(state, search[6], True, data, values) > 0:
+            best = int(np.argmax(values))
+            if values[best] > values[route] + search[8]:
+                route = best
+        observation, reward, over = pursue(state, candidates[route], data[0].shape[1], data)
+        total += reward
+        if over:
+            return total
+    return total + wait_for(state, candidates[route], data)
 
 
-def prior(state, action, _observation, _depth, data, values, counts):
-    """At a node below the root: what the routes were worth from the start, less the ticks gone by; keeping on counts more."""
+def prior(state, action, observation, _depth, data, values, counts):
+    """At a node below the root: what the routes are worth against the paths that look alike; keeping on counts more."""
     baseline, search, per_tick = data[8], data[9], data[5][1]
+    alike = 0
+    if observation != UNSEEN:
+        alike = prospects(state, search[6], True, data, values)
+    if alike == 0:
+        for a in range(values.shape[0]):
+            values[a] = baseline[a] - per_tick * state[1]
     for a in range(values.shape[0]):
-        values[a] = baseline[a] - per_tick * state[1]
         counts[a] = int(search[4])
     counts[action] = int(search[5])
