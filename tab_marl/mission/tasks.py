@@ -85,9 +85,10 @@ def _attempt(
 ) -> Task | None:
     scenario = sample_scenario(rng, options, name=f"{mission_id}-{family}")
     if family == "perimeter":
-        scenario = _widen(rng, scenario, mission_id)
-        if scenario is None:
+        widened = _widen(rng, scenario, mission_id)
+        if widened is None:
             return None
+        scenario = widened
     legs = _legs(rng, scenario, mission_id, family)
     if legs is None:
         return None
@@ -204,6 +205,7 @@ class _Travel:
 
     def ways(self, start: tuple[float, float], legs: list[tuple[Place, ...]], mission_id: str) -> list[_Way]:
         """The shortest way for each choice of last goal (M2: of both goals; M5: over the best three checkpoints)."""
+        orders: list[tuple[Place, ...]]
         if mission_id == "M2":
             orders = [(a, b) for a in legs[0] for b in legs[1]]
         elif mission_id == "M5":
