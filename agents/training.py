@@ -213,7 +213,7 @@ def _restore(model: PPO, env: BatchedVecEnv, path: Path) -> None:
         record = torch.load(path, weights_only=True)
         text = json.loads(record["text"])
         version = record["version"]
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001, a damaged file makes torch raise almost anything
         raise TrainingError(
             f"cannot read the checkpoint {path} ({type(error).__name__}): delete it to begin the run anew"
         ) from None

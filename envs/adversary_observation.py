@@ -29,6 +29,7 @@ row    name                meaning
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,8 +67,11 @@ class AdversaryTask:
     mission: Mission
     style: Style
     parts: Parts = field(repr=False)
-    tables: Tables = field(repr=False)
-    """A bank that holds this task alone."""
+
+    @cached_property
+    def tables(self) -> Tables:
+        """A bank that holds this task alone."""
+        return pack([self.parts])
 
     @property
     def automaton(self) -> MissionAutomaton:
@@ -91,67 +95,100 @@ class AdversaryTask:
         rng: np.random.Generator,
         cell_metres: float = ROUTE_CELL_METRES,
     ) -> AdversaryTask:
-        """Draw the style's latents and solve the route fields (up to 10 ms; M5 up to 40 ms)."""
-        latents = style.draw(rng)
+        """Draw the style's latents and solve the route fields (about 10 ms; M5 30 ms)."""
+        return cls.draw(scenario, mission, style, rng, 1, cell_metres)[0]
+
+    @classmethod
+    def draw(
+        cls,
+        scenario: Scenario,
+        mission: Mission,
+        style: Style,
+        rng: np.random.Generator,
+        count: int,
+        cell_metres: float = ROUTE_CELL_METRES,
+    ) -> list[AdversaryTask]:
+        """`count` tasks that differ in their latents; what they share is computed once."""
         automaton = compile_mission(mission, scenario, 1.0 / scenario.control_hertz)
-        parts = _build(scenario, automaton, latents, GridMap.from_scenario(scenario, cell_metres))
-        return cls(scenario, mission, style, parts, pack([parts]))
+        plain = _Plain.of(scenario, automaton, GridMap.from_scenario(scenario, cell_metres))
+        parts = [_styled(plain, style.draw(rng)) for _ in range(count)]
+        return [cls(scenario, mission, style, part) for part in parts]
 
 
-def _build(scenario: Scenario, automaton: MissionAutomaton, latents: Latents, grid: GridMap) -> Parts:
-    forbidden = zones(automaton).any(axis=0)
-    zone_distance = np.full(grid.cells, np.inf)
-    for region in (r for r, bad in zip(automaton.regions, forbidden, strict=True) if bad):
-        zone_distance = np.minimum(zone_distance, region.distance(grid.centres))
-    clearance = clearance_cost(grid, zone_distance)
-    plain = solve_route(automaton, grid, clearance)
-    start = scenario.adversary_start.centre
-    home = automaton.first(int(automaton.masks(start)[0])).location
-    windows = later_windows(automaton, round(scenario.horizon_seconds / automaton.tick_seconds))
-    no_via = np.zeros((0, 2))
-    if home < 0 or not _fits(plain, home, home, windows, scenario, 1.0 / SLACK_NEEDED):
+@dataclass(frozen=True, eq=False)
+class _Plain:
+    """What all styles share: the route without style, where it begins, and the time it leaves."""
+
+    scenario: Scenario
+    automaton: MissionAutomaton
+    zone_distance: NDArray[np.float64]
+    """``[S]`` metres to the nearest region that fails the mission, inf if there is none."""
+    clearance: NDArray[np.float64]
+    route: RouteField
+    home: int
+    """The mission's location after tick 0 at the middle of the start region."""
+    windows: NDArray[np.int32]
+
+    @classmethod
+    def of(cls, scenario: Scenario, automaton: MissionAutomaton, grid: GridMap) -> _Plain:
+        zone_distance = np.full(grid.cells, np.inf)
+        for region, fails in zip(automaton.regions, zones(automaton).any(axis=0), strict=True):
+            if fails:
+                zone_distance = np.minimum(zone_distance, region.distance(grid.centres))
+        clearance = clearance_cost(grid, zone_distance)
+        windows = later_windows(automaton, round(scenario.horizon_seconds / automaton.tick_seconds))
+        home = automaton.first(int(automaton.masks(scenario.adversary_start.centre)[0])).location
+        return cls(
+            scenario, automaton, zone_distance, clearance, solve_route(automaton, grid, clearance), home, windows
+        )
+
+    def parts(self, latents: Latents, strength: float) -> Parts:
+        """The task on the plain route."""
+        nowhere = np.zeros((0, 2))
+        return Parts(
+            self.scenario, self.automaton, self.route, self.route, nowhere, self.home, latents, strength, self.windows
+        )  # fmt: skip
+
+
+def _styled(plain: _Plain, latents: Latents) -> Parts:
+    scenario, grid, home = plain.scenario, plain.route.grid, plain.home
+    if home < 0 or not _fits(plain.route, home, plain, 1.0 / SLACK_NEEDED):
         # No time to spare: straight, and as early as possible.
-        return Parts(scenario, automaton, plain, plain, no_via, home, Latents(seed=latents.seed), 0.0, windows)
+        return plain.parts(Latents(seed=latents.seed), 0.0)
     if not latents.bends_route:
-        return Parts(scenario, automaton, plain, plain, no_via, home, latents, 1.0, windows)
+        return plain.parts(latents, 1.0)
     rng = np.random.default_rng(latents.seed + 1)
-    dear = {name: float(rng.uniform(0, latents.order_metres)) for name in automaton.branch_places}
+    dear = {name: float(rng.uniform(0, latents.order_metres)) for name in plain.automaton.branch_places}
     for strength in STRENGTHS:
-        via = _via_points(rng, plain, home, start, latents.via_points, strength, zone_distance)
+        via = _via_points(rng, plain, latents.via_points, strength)
         route = solve_route(
-            automaton,
+            plain.automaton,
             grid,
-            styled_cost(scenario, grid, clearance, latents, strength),
+            styled_cost(scenario, grid, plain.clearance, latents, strength),
             place_metres={name: strength * metres for name, metres in dear.items()},
             via=via,
             via_location=home,
         )
-        first = route.via_locations[0] if via else home
-        if _fits(route, first, home, windows, scenario, TIME_SHARE):
+        if _fits(route, route.via_locations[0] if via else home, plain, TIME_SHARE):
             points = np.asarray(via, dtype=np.float64).reshape(-1, 2)
-            return Parts(scenario, automaton, plain, route, points, home, latents, strength, windows)
-    return Parts(scenario, automaton, plain, plain, no_via, home, latents, 0.0, windows)
+            return Parts(
+                scenario, plain.automaton, plain.route, route, points, home, latents, strength, plain.windows
+            )  # fmt: skip
+    return plain.parts(latents, 0.0)
 
 
 def _via_points(
-    rng: np.random.Generator,
-    plain: RouteField,
-    home: int,
-    start: tuple[float, float],
-    count: int,
-    strength: float,
-    zone_distance: NDArray[np.float64],
+    rng: np.random.Generator, plain: _Plain, count: int, strength: float
 ) -> tuple[tuple[float, float], ...]:
     """Free points off all places and zones, one after the other a detour of some length; fewer if none is found."""
-    grid = plain.grid
-    off_places = (plain.automaton.masks(grid.centres) == 0) & (zone_distance > VIA_CLEAR_METRES)
+    grid, to_go = plain.route.grid, plain.route.length[plain.home]
+    free = (plain.automaton.masks(grid.centres) == 0) & (plain.zone_distance > VIA_CLEAR_METRES)
     chosen: list[tuple[float, float]] = []
-    here = np.asarray(start, dtype=np.float64)
+    here = np.asarray(plain.scenario.adversary_start.centre, dtype=np.float64)
     low, high = VIA_DETOUR_METRES
     for _ in range(count):
-        usual = float(plain.length[home, grid.cells_of(here)[0]])
-        detour = np.hypot(*(grid.centres - here).T) + plain.length[home] - usual
-        candidates = np.flatnonzero(off_places & (detour >= low) & (detour <= max(low + 0.2, high * strength)))
+        detour = np.hypot(*(grid.centres - here).T) + to_go - to_go[grid.cells_of(here)[0]]
+        candidates = np.flatnonzero(free & (detour >= low) & (detour <= max(low + 0.2, high * strength)))
         if len(candidates) == 0:
             break
         here = grid.centres[rng.choice(candidates)]
@@ -159,20 +196,18 @@ def _via_points(
     return tuple(chosen)
 
 
-def _fits(
-    route: RouteField, first: int, home: int, windows: NDArray[np.int32], scenario: Scenario, share: float
-) -> bool:
+def _fits(route: RouteField, first: int, plain: _Plain, share: float) -> bool:
     """Whether following the route from the start needs at most this share of each time allowed on the way.
 
-    `first` is the route's location at the start, `home` the mission's (they differ while a via point is ahead).
+    `first` is the route's location at the start (it differs from the mission's while a via point is ahead).
     """
-    automaton, tick = route.automaton, route.automaton.tick_seconds
-    cells, locations = route.path(first, scenario.adversary_start.centre)
+    automaton, tick, robot = route.automaton, route.automaton.tick_seconds, plain.scenario.adversary
+    cells, locations = route.path(first, plain.scenario.adversary_start.centre)
     if len(cells) < 2 or locations[-1] != COMPLETED:
         return False
     points = route.grid.centres[cells]
-    at = np.where(locations[:-1] >= automaton.locations, home, locations[:-1])
-    seconds = np.hypot(*np.diff(points, axis=0).T) / np.minimum(scenario.adversary.max_speed, automaton.speed_limit[at])
+    at = np.where(locations[:-1] >= automaton.locations, plain.home, locations[:-1])
+    seconds = np.hypot(*np.diff(points, axis=0).T) / np.minimum(robot.max_speed, automaton.speed_limit[at])
     counted = automaton.progress[at, automaton.masks(points[1:])] & (locations[1:] != locations[:-1])
     counted &= locations[:-1] < automaton.locations
     since_start = since_visit = 0.0
@@ -184,7 +219,7 @@ def _fits(
         since_start += TURN_SECONDS
         since_visit += TURN_SECONDS
         latest = np.where(automaton.latest[u] >= UNBOUNDED, np.inf, automaton.latest[u] * tick)
-        if since_start > share * min(latest[0], windows[u, 1] * tick) or since_visit > share * min(latest[1:]):
+        if since_start > share * min(latest[0], plain.windows[u, 1] * tick) or since_visit > share * min(latest[1:]):
             return False
         since_visit = 0.0
     return True

@@ -75,6 +75,11 @@ class Style:
             raise UnknownName("style", name, STYLES)
         return STYLES[name]
 
+    @property
+    def varies(self) -> bool:
+        """Whether two draws can differ."""
+        return self != Style(name=self.name)
+
     def draw(self, rng: np.random.Generator) -> Latents:
         """Latents of one episode. Every draw takes the same numbers from `rng`, whatever is switched on."""
         side_on, sign, via_on = rng.random(), rng.random(), rng.random()
