@@ -108,14 +108,29 @@ def _plain(function: Callable[..., Any]) -> Callable[..., Any]:
     return plain
 
 
+class _Callback:
+    """A compiled function as an argument of the search.
+
+    A numba CFunc would do, but its type is worked out anew at each call, which takes as long as a hundred simulations.
+    """
+
+    def __init__(self, function: Any, signature: Any) -> None:
+        self._function = function  # keeps the machine code alive
+        self._address = int(function.address)
+        self._numba_type_ = types.FunctionType(signature)
+
+    def __wrapper_address__(self) -> int:
+        return self._address
+
+
 @lru_cache(maxsize=512)
-def _compiled(function: Callable[..., Any], signature: Any) -> Any:
+def _compiled(function: Callable[..., Any], signature: Any) -> _Callback:
     try:
-        return cfunc(signature, cache=True)(function)
+        return _Callback(cfunc(signature, cache=True)(function), signature)
     except RuntimeError as error:  # a function typed at a prompt has no file beside which to keep a cache
         if "locator" not in str(error):
             raise
-        return cfunc(signature)(function)
+        return _Callback(cfunc(signature)(function), signature)
 
 
 @dataclass(frozen=True, eq=False)
