@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tab_marl.field import kernels
-from tab_marl.field.reference import Reference, from_matrices
+from tab_marl.field.reference import Motion, Reference, from_matrices
 
 Table = NDArray[np.float32] | NDArray[np.float64]
 
@@ -42,20 +42,14 @@ class ProductChain(NamedTuple):
     cell of s'. From absorbing q, and wherever norm is 0, the plain reference goes on, scaled to sum to 1.
     """
 
-    indptr: NDArray[np.int64]
-    """``[R * S + 1]`` CSR rows of the references (see `Reference`)."""
-    indices: NDArray[np.int32]
-    data: NDArray[np.float64]
-    mix: NDArray[np.float64]
-    """``[R, M, M]``."""
-    mix_order: NDArray[np.int32]
-    """``[R, M, M]`` new modes by falling probability."""
-    row_sum: NDArray[np.float64]
-    """``[R * S]`` what one tick of the plain reference keeps."""
+    motion: Motion
+    """The references."""
     reference_of: NDArray[np.int32]
     """``[Q]``."""
     labels: NDArray[np.int32]
     """``[C]`` symbol of each cell."""
+    symbol_of: NDArray[np.int32]
+    """``[S]`` the same for each base state."""
     delta: NDArray[np.int32]
     """``[Q, L]``."""
     factor: NDArray[np.float64]
@@ -85,7 +79,7 @@ class ProductChain(NamedTuple):
 
     @property
     def modes(self) -> int:
-        return self.mix.shape[1]
+        return self.motion.mix.shape[1]
 
     @property
     def states(self) -> int:
@@ -169,28 +163,15 @@ def product_chain(
         norm = table
     else:
         norm = np.zeros_like(table)
-        kernels.normalisers(
-            transient, reference.indptr, reference.indices, reference.data, reference.mix, which, symbols, delta, tilt,
-            table, scale, norm,
-        )  # fmt: skip
+        kernels.normalisers(transient, reference.motion, which, symbols, delta, tilt, table, scale, norm)
     with np.errstate(invalid="ignore"):
         factor = tilt * np.exp(scale[delta] - scale[:, None])
     factor[~np.isfinite(factor)] = 0.0
-    row_sum = np.zeros((reference.count, states))
-    for r in range(reference.count):
-        kernels.expect_row(
-            r * states, reference.indptr, reference.indices, reference.data, reference.mix[r], np.ones(states),
-            row_sum[r],
-        )  # fmt: skip
     return ProductChain(
-        reference.indptr,
-        reference.indices,
-        reference.data,
-        reference.mix,
-        np.argsort(-reference.mix, axis=2, kind="stable").astype(np.int32),
-        row_sum.ravel(),
+        reference.motion,
         which,
         symbols,
+        np.repeat(symbols, modes),
         delta,
         factor,
         table,

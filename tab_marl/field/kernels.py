@@ -5,6 +5,8 @@ Arrays and scalars only; nothing here validates or raises. Each has a slow twin 
 Letters: C cells, M modes (headings and rest), S = C * M base states, cell-major (``s = cell * M + mode``), Q automaton
 states, L label symbols, R references. One tick of reference r: the mode is redrawn by ``mix[r, m, m']``, then the state
 moves by CSR row ``r * S + cell * M + m'``; rows may sum to less than 1 (the rest of the mass is killed).
+`motion` is a `reference.Motion`: the moves, and `mix` once more as what lies near a mode plus a jump to any mode,
+``mix[r, m] = near(m) + jump[r, m] * redraw[r]``; rows of constant `width` 4 take an unrolled path.
 A table ``value[q, s]`` holds h / exp(log_scale[q]).
 """
 
@@ -17,36 +19,47 @@ from numba import njit
 
 
 @njit(cache=True)
-def expect_row(moves_from, indptr, indices, data, mix, ahead, out):
-    """``out[s] = sum_s' P(s'|s) ahead[s']`` for one reference: CSR rows from `moves_from` on, `mix` ``[M, M]``."""
-    modes = mix.shape[0]
+def expect_row(motion, r, ahead, out):
+    """``out[s] = sum_s' P(s'|s) ahead[s']`` under reference r."""
+    modes = motion.mix.shape[1]
     states = out.shape[0]
-    if modes == 1:
-        for s in range(states):
-            total = 0.0
-            for k in range(indptr[moves_from + s], indptr[moves_from + s + 1]):
-                total += data[k] * ahead[indices[k]]
-            out[s] = total
-        return
-    transposed = mix.T.copy()
+    indices, data, width = motion.indices, motion.data, motion.width
+    near = motion.near_share.shape[2]
     moved = np.empty(modes)
-    drawn = np.empty(modes)
     for first in range(0, states, modes):
-        alive = False
+        redrawn = 0.0
+        row = r * states + first
         for m in range(modes):
             total = 0.0
-            for k in range(indptr[moves_from + first + m], indptr[moves_from + first + m + 1]):
-                total += data[k] * ahead[indices[k]]
+            if width == 4:
+                k = 4 * (row + m)
+                total = (
+                    data[k] * ahead[indices[k]]
+                    + data[k + 1] * ahead[indices[k + 1]]
+                    + data[k + 2] * ahead[indices[k + 2]]
+                    + data[k + 3] * ahead[indices[k + 3]]
+                )
+            else:
+                for k in range(motion.indptr[row + m], motion.indptr[row + m + 1]):
+                    total += data[k] * ahead[indices[k]]
             moved[m] = total
-            alive = alive or total > 0.0
-        drawn[:] = 0.0
-        if alive:
-            for after in range(modes):
-                if moved[after] > 0.0:
-                    for m in range(modes):
-                        drawn[m] += transposed[after, m] * moved[after]
-        for m in range(modes):
-            out[first + m] = drawn[m]
+            redrawn += motion.redraw[r, m] * total
+        if modes == 1:
+            out[first] = moved[0]
+        elif near == 3:
+            for m in range(modes):
+                out[first + m] = (
+                    motion.jump[r, m] * redrawn
+                    + motion.near_share[r, m, 0] * moved[motion.near_mode[r, m, 0]]
+                    + motion.near_share[r, m, 1] * moved[motion.near_mode[r, m, 1]]
+                    + motion.near_share[r, m, 2] * moved[motion.near_mode[r, m, 2]]
+                )
+        else:
+            for m in range(modes):
+                total = motion.jump[r, m] * redrawn
+                for j in range(near):
+                    total += motion.near_share[r, m, j] * moved[motion.near_mode[r, m, j]]
+                out[first + m] = total
 
 
 @njit(cache=True)
@@ -75,12 +88,12 @@ def look_ahead(q, labels, delta, weight, value, log_scale, modes, ahead):
 
 
 @njit(cache=True)
-def backward(order, indptr, indices, data, mix, reference_of, labels, delta, weight, peak, value, log_scale):
+def backward(order, motion, reference_of, labels, delta, weight, peak, value, log_scale):
     """Backward messages of the automaton states in `order` (falling rank), each row scaled to a maximum of `peak`.
 
     Rows of `value` and `log_scale` for absorbing states are inputs, the others outputs (design, section 4).
     """
-    modes = mix.shape[1]
+    modes = motion.mix.shape[1]
     states = value.shape[1]
     ahead = np.empty(states)
     row = np.empty(states)
@@ -90,8 +103,7 @@ def backward(order, indptr, indices, data, mix, reference_of, labels, delta, wei
             value[q, :] = 0.0
             log_scale[q] = -math.inf
             continue
-        r = reference_of[q]
-        expect_row(r * states, indptr, indices, data, mix[r], ahead, row)
+        expect_row(motion, reference_of[q], ahead, row)
         largest = 0.0
         for s in range(states):
             largest = max(largest, row[s])
@@ -106,9 +118,9 @@ def backward(order, indptr, indices, data, mix, reference_of, labels, delta, wei
 
 
 @njit(cache=True)
-def normalisers(order, indptr, indices, data, mix, reference_of, labels, delta, weight, value, log_scale, norm):
+def normalisers(order, motion, reference_of, labels, delta, weight, value, log_scale, norm):
     """``norm[q, s] = sum_s' P(s'|s) w h[q', s'] / exp(log_scale[q])`` for any table, harmonic or not."""
-    modes = mix.shape[1]
+    modes = motion.mix.shape[1]
     states = value.shape[1]
     ahead = np.empty(states)
     row = np.empty(states)
@@ -117,81 +129,110 @@ def normalisers(order, indptr, indices, data, mix, reference_of, labels, delta, 
         factor = 0.0
         if base > -math.inf and log_scale[q] > -math.inf:
             factor = math.exp(base - log_scale[q])
-        r = reference_of[q]
-        expect_row(r * states, indptr, indices, data, mix[r], ahead, row)
+        expect_row(motion, reference_of[q], ahead, row)
         for s in range(states):
             norm[q, s] = row[s] * factor
+
+
+@njit(cache=True)
+def scatter_cell(motion, r, states, first, before, drawn, out):
+    """Add ``sum_m before[m] P(s'|first + m)`` to ``out[S]``: one cell's masses, redrawn and moved. `drawn`: scratch."""
+    modes = before.shape[0]
+    if modes == 1:
+        drawn[0] = before[0]
+    else:
+        jumping = 0.0
+        for m in range(modes):
+            jumping += before[m] * motion.jump[r, m]
+        for m in range(modes):
+            drawn[m] = jumping * motion.redraw[r, m]
+        for m in range(modes):
+            amount = before[m]
+            if amount > 0.0:
+                for j in range(motion.near_share.shape[2]):
+                    drawn[motion.near_mode[r, m, j]] += amount * motion.near_share[r, m, j]
+    indices, data = motion.indices, motion.data
+    for m in range(modes):
+        amount = drawn[m]
+        if amount > 0.0:
+            row = r * states + first + m
+            if motion.width == 4:
+                k = 4 * row
+                out[indices[k]] += amount * data[k]
+                out[indices[k + 1]] += amount * data[k + 1]
+                out[indices[k + 2]] += amount * data[k + 2]
+                out[indices[k + 3]] += amount * data[k + 3]
+            else:
+                for k in range(motion.indptr[row], motion.indptr[row + 1]):
+                    out[indices[k]] += amount * data[k]
 
 
 @njit(cache=True)
 def push(mass, q, free, chain, slot, rows, flux):
     """Move the mass ``[S]`` of automaton state q one tick on, adding it to ``rows[slot[q']]``; ``flux[l]`` counts it.
 
-    The kernel is ``P(s'|s) factor[q, l'] value[q', s'] / norm[q, s]``, factor = w exp(log_scale[q'] - log_scale[q]). A free q (absorbing), and any state from which nothing
-    of weight lies ahead, follows the reference process, renormalised where it would be killed.
-    Mass whose automaton state has no slot (< 0) is counted in the flux only.
+    The kernel is ``P(s'|s) factor[q, l'] value[q', s'] / norm[q, s]``, factor = w exp(log_scale[q'] - log_scale[q]).
+    A free q (absorbing), and any state from which nothing of weight lies ahead, follows the reference process, scaled
+    to sum to 1 where it would be killed. Mass whose automaton state has no slot (< 0) is counted in the flux only.
     """
-    modes = chain.mix.shape[1]
+    motion = chain.motion
+    modes = motion.mix.shape[1]
     states = mass.shape[0]
     r = chain.reference_of[q]
-    mix = chain.mix[r]
-    factor = chain.factor[q]
-    tilted = np.empty(modes)
-    plain = np.empty(modes)
-    tilted_drawn = np.empty(modes)
-    plain_drawn = np.empty(modes)
+    # Sums of mass * P(s'|s), to be weighed by what lies ahead of s' (tilted) or not (plain).
+    tilted = np.zeros(states)
+    plain = np.zeros(states)
+    any_tilted, any_plain = False, False
+    bridging = np.empty(modes)
+    drifting = np.empty(modes)
+    drawn = np.empty(modes)
     for first in range(0, states, modes):
-        any_tilted, any_plain = False, False
+        some_bridging, some_drifting = False, False
         for m in range(modes):
-            tilted[m] = 0.0
-            plain[m] = 0.0
+            bridging[m] = 0.0
+            drifting[m] = 0.0
             here = mass[first + m]
-            if here <= 0.0:
-                continue
-            norm = 0.0
-            if not free:
-                norm = chain.norm[q, first + m]
-            if norm > 0.0:
-                tilted[m] = here / norm
-                any_tilted = True
-            else:
-                survives = chain.row_sum[r * states + first + m]
-                if survives > 0.0:
-                    plain[m] = here / survives
-                    any_plain = True
+            if here > 0.0:
+                norm = 0.0
+                if not free:
+                    norm = chain.norm[q, first + m]
+                if norm > 0.0:
+                    bridging[m] = here / norm
+                    some_bridging = True
                 else:
-                    symbol = chain.labels[first // modes]
-                    flux[symbol] += here
-                    if slot[chain.delta[q, symbol]] >= 0:
-                        rows[slot[chain.delta[q, symbol]], first + m] += here
-        if not (any_tilted or any_plain):
-            continue
-        tilted_drawn[:] = 0.0
-        plain_drawn[:] = 0.0
-        for m in range(modes):
-            if tilted[m] > 0.0:
-                for after in range(modes):
-                    tilted_drawn[after] += tilted[m] * mix[m, after]
-            if plain[m] > 0.0:
-                for after in range(modes):
-                    plain_drawn[after] += plain[m] * mix[m, after]
-        for after in range(modes):
-            bridge, reference = tilted_drawn[after], plain_drawn[after]
-            if bridge == 0.0 and reference == 0.0:
-                continue
-            start = r * states + first + after
-            for k in range(chain.indptr[start], chain.indptr[start + 1]):
-                target = chain.indices[k]
-                symbol = chain.labels[target // modes]
-                following = chain.delta[q, symbol]
-                amount = reference
-                if bridge > 0.0 and factor[symbol] > 0.0:
-                    amount += bridge * factor[symbol] * chain.value[following, target]
-                amount *= chain.data[k]
-                if amount > 0.0:
-                    flux[symbol] += amount
-                    if slot[following] >= 0:
-                        rows[slot[following], target] += amount
+                    survives = motion.row_sum[r * states + first + m]
+                    if survives > 0.0:
+                        drifting[m] = here / survives
+                        some_drifting = True
+                    else:
+                        plain[first + m] += here
+                        any_plain = True
+        if some_bridging:
+            any_tilted = True
+            scatter_cell(motion, r, states, first, bridging, drawn, tilted)
+        if some_drifting:
+            any_plain = True
+            scatter_cell(motion, r, states, first, drifting, drawn, plain)
+    for cell in range(chain.labels.shape[0]):
+        symbol = chain.labels[cell]
+        following = chain.delta[q, symbol]
+        row = slot[following]
+        factor = chain.factor[q, symbol]
+        first = cell * modes
+        total = 0.0
+        if any_tilted and factor > 0.0:
+            for s in range(first, first + modes):
+                if tilted[s] > 0.0:
+                    amount = tilted[s] * factor * chain.value[following, s]
+                    total += amount
+                    if row >= 0:
+                        rows[row, s] += amount
+        if any_plain:
+            for s in range(first, first + modes):
+                total += plain[s]
+                if row >= 0:
+                    rows[row, s] += plain[s]
+        flux[symbol] += total
 
 
 @njit(cache=True)
@@ -242,56 +283,100 @@ def draw_states(masses, total, count, offset, slots, states):
 
 
 @njit(cache=True)
-def sample_step(chain, q, s, uniform):
-    """The next base state from (q, s), by inverting the kernel of `push` at `uniform` in [0, 1)."""
-    modes = chain.mix.shape[1]
+def next_uniform(streams, i):
+    """A uniform of [0, 1) from stream i: SplitMix64 (Steele, Lea and Flood 2014)."""
+    streams[i] += np.uint64(0x9E3779B97F4A7C15)
+    z = streams[i]
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    z = z ^ (z >> np.uint64(31))
+    return np.float64(z >> np.uint64(11)) * (1.0 / 9007199254740992.0)
+
+
+@njit(cache=True)
+def bridge_step(chain, q, s, uniform):
+    """The next base state from (q, s) with norm > 0, by inverting the kernel of `push` at `uniform` in [0, 1).
+
+    New modes are tried by falling probability, so most draws end after a few terms.
+    """
+    motion = chain.motion
+    modes = motion.mix.shape[1]
     states = chain.value.shape[1]
     r = chain.reference_of[q]
     mode = s % modes
     first = s - mode
-    norm = 0.0
-    if q != chain.accepting and q != chain.rejecting:
-        norm = chain.norm[q, s]
-    bridge = norm > 0.0
-    target = uniform * (norm if bridge else chain.row_sum[r * states + s])
+    target = uniform * chain.norm[q, s]
     reached = 0.0
-    found = s
+    found = -1
     for j in range(modes):
-        after = chain.mix_order[r, mode, j]
-        share = chain.mix[r, mode, after]
+        after = motion.mix_order[r, mode, j]
+        share = motion.mix[r, mode, after]
         if share <= 0.0:
             break
-        start = r * states + first + after
-        for k in range(chain.indptr[start], chain.indptr[start + 1]):
-            following = chain.indices[k]
-            amount = share * chain.data[k]
-            if bridge:
-                symbol = chain.labels[following // modes]
-                amount *= chain.factor[q, symbol] * chain.value[chain.delta[q, symbol], following]
+        row = r * states + first + after
+        for k in range(motion.indptr[row], motion.indptr[row + 1]):
+            following = motion.indices[k]
+            symbol = chain.symbol_of[following]
+            amount = share * motion.data[k] * chain.factor[q, symbol]
             if amount > 0.0:
-                found = following
-                reached += amount
-                if reached > target:
-                    return found
+                amount *= chain.value[chain.delta[q, symbol], following]
+                if amount > 0.0:
+                    found = following
+                    reached += amount
+                    if reached > target:
+                        return found
     return found
 
 
 @njit(cache=True)
-def sample_paths(chain, uniforms, automaton_states, base_states, completed_tick):
+def reference_step(motion, r, states, s, streams, i):
+    """The next base state of the plain reference, given that it is not killed: redrawn until it survives."""
+    modes = motion.mix.shape[1]
+    mode = s % modes
+    first = s - mode
+    if motion.row_sum[r * states + s] <= 0.0:
+        return s
+    while True:
+        after = 0
+        if modes > 1:
+            target = next_uniform(streams, i)
+            reached = 0.0
+            for j in range(modes):
+                after = motion.mix_order[r, mode, j]
+                reached += motion.mix[r, mode, after]
+                if reached > target:
+                    break
+        target = next_uniform(streams, i)
+        reached = 0.0
+        row = r * states + first + after
+        for k in range(motion.indptr[row], motion.indptr[row + 1]):
+            reached += motion.data[k]
+            if reached > target:
+                return motion.indices[k]
+
+
+@njit(cache=True)
+def sample_paths(chain, streams, automaton_states, base_states, completed_tick):
     """Fill ``[K, ticks + 1]`` automaton and base states from column 0 on; ``completed_tick[K]``, -1 if never."""
-    modes = chain.mix.shape[1]
-    count, ticks = uniforms.shape
+    states = chain.value.shape[1]
+    count, columns = base_states.shape
     for i in range(count):
-        q = automaton_states[i, 0]
-        s = base_states[i, 0]
-        completed_tick[i] = 0 if q == chain.accepting else -1
-        for t in range(ticks):
-            s = sample_step(chain, q, s, uniforms[i, t])
-            q = chain.delta[q, chain.labels[s // modes]]
-            automaton_states[i, t + 1] = q
-            base_states[i, t + 1] = s
+        completed_tick[i] = 0 if automaton_states[i, 0] == chain.accepting else -1
+    # Tick by tick: the paths of one tick read the same rows of the table.
+    for t in range(1, columns):
+        for i in range(count):
+            q = automaton_states[i, t - 1]
+            s = base_states[i, t - 1]
+            following = -1
+            if q != chain.accepting and q != chain.rejecting and chain.norm[q, s] > 0.0:
+                following = bridge_step(chain, q, s, next_uniform(streams, i))
+            if following < 0:
+                following = reference_step(chain.motion, chain.reference_of[q], states, s, streams, i)
+            q = chain.delta[q, chain.symbol_of[following]]
+            automaton_states[i, t] = q
+            base_states[i, t] = following
             if q == chain.accepting and completed_tick[i] < 0:
-                completed_tick[i] = t + 1
+                completed_tick[i] = t
 
 
 @njit(cache=True)

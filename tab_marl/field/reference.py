@@ -8,11 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
+from tab_marl.field import kernels
 from tab_marl.world.grid import BLOCKED, GridMap
 
 # Run and tumble: events per mean run length. Small turns go to a neighbouring heading, redraws to any heading or rest.
@@ -20,6 +23,34 @@ from tab_marl.world.grid import BLOCKED, GridMap
 TURNS_PER_RUN = 0.8
 REDRAWS_PER_RUN = 0.5
 REST_SHARE = 0.1
+
+UNROLLED_WIDTH = 4
+"""Row length for which the kernels are unrolled: a displacement rounded to cells has at most four ends."""
+
+
+class Motion(NamedTuple):
+    """R references as arrays for the kernels."""
+
+    indptr: NDArray[np.int64]
+    """``[R * S + 1]``: CSR row ``r * S + s``."""
+    indices: NDArray[np.int32]
+    data: NDArray[np.float64]
+    width: int
+    """The length of every row, or 0 if they differ."""
+    mix: NDArray[np.float64]
+    """``[R, M, M]``."""
+    mix_order: NDArray[np.int32]
+    """``[R, M, M]`` new modes by falling probability."""
+    jump: NDArray[np.float64]
+    """``[R, M]`` probability of a jump to a mode drawn from `redraw`."""
+    redraw: NDArray[np.float64]
+    """``[R, M]``."""
+    near_mode: NDArray[np.int32]
+    """``[R, M, W]`` the other new modes."""
+    near_share: NDArray[np.float64]
+    """``[R, M, W]``."""
+    row_sum: NDArray[np.float64]
+    """``[R * S]`` what one tick keeps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +69,10 @@ class Reference:
     """``[R, M, M]``, rows sum to 1."""
     headings: NDArray[np.float64]
     """``[M]`` radians; nan for rest and for memoryless references."""
+    jump: NDArray[np.float64]
+    """``[R, M]``: the part of a row of `mix` that is a jump to a mode drawn from `redraw`; only a shorter way to compute."""
+    redraw: NDArray[np.float64]
+    """``[R, M]``."""
 
     @property
     def count(self) -> int:
@@ -50,6 +85,33 @@ class Reference:
     @property
     def states(self) -> int:
         return (len(self.indptr) - 1) // self.count
+
+    @cached_property
+    def motion(self) -> Motion:
+        """Everything the kernels need, derived once."""
+        near = self.mix - self.jump[:, :, None] * self.redraw[:, None, :]
+        near[np.abs(near) < 1e-15] = 0.0
+        width = max(1, int((near != 0).sum(axis=2).max()))
+        order = np.argsort(-np.abs(near), axis=2, kind="stable")[:, :, :width]
+        lengths = np.diff(self.indptr)
+        constant = int(lengths[0]) if len(lengths) and (lengths == lengths[0]).all() else 0
+        motion = Motion(
+            self.indptr,
+            self.indices,
+            self.data,
+            constant,
+            self.mix,
+            np.argsort(-self.mix, axis=2, kind="stable").astype(np.int32),
+            self.jump,
+            self.redraw,
+            order.astype(np.int32),
+            np.take_along_axis(near, order, axis=2),
+            np.zeros(self.count * self.states),
+        )
+        for r in range(self.count):
+            row = motion.row_sum[r * self.states : (r + 1) * self.states]
+            kernels.expect_row(motion, r, np.ones(self.states), row)
+        return motion
 
     def mode_shares(self) -> NDArray[np.float64]:
         """``[M]``: the stationary distribution of the mode under reference 0."""
@@ -69,13 +131,20 @@ class Reference:
         return sparse.csr_array(redraw @ moves)
 
 
-def from_matrices(transitions: object, mix: ArrayLike | None = None, headings: ArrayLike | None = None) -> Reference:
+def from_matrices(
+    transitions: object,
+    mix: ArrayLike | None = None,
+    headings: ArrayLike | None = None,
+    jump: ArrayLike | None = None,
+    redraw: ArrayLike | None = None,
+) -> Reference:
     """A reference from ``[S, S]`` matrices (dense or any SciPy sparse), one or a sequence of R.
 
     Args:
         transitions: rows say where a base state goes; each sums to 1, or to less where motion is lost to walls.
         mix: ``[M, M]`` or ``[R, M, M]``, how the mode is redrawn before the move; default: one mode.
         headings: ``[M]`` radians.
+        jump, redraw: ``[M]`` each: ``mix = near + outer(jump, redraw)`` with `near` sparse is computed faster.
     Raises:
         ValueError: an entry is negative or not finite, a row sums to more than 1, or the shapes do not fit.
     """
@@ -109,13 +178,30 @@ def from_matrices(transitions: object, mix: ArrayLike | None = None, headings: A
     if angles.shape != (modes,):
         raise ValueError(f"headings has shape {angles.shape}, must be [{modes}], one per mode")
     lengths = np.concatenate([np.diff(p.indptr) for p in parts])
+    indices, data = np.concatenate([p.indices for p in parts]), np.concatenate([p.data for p in parts])
+    if lengths.max(initial=0) <= UNROLLED_WIDTH:
+        lengths, indices, data = _padded(lengths, indices, data)
     return Reference(
         np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
-        np.concatenate([p.indices for p in parts]).astype(np.int32),
-        np.concatenate([p.data for p in parts]),
+        indices.astype(np.int32),
+        data,
         mixing,
         angles,
+        np.broadcast_to(np.zeros(modes) if jump is None else np.asarray(jump), (len(parts), modes)).astype(np.float64),
+        np.broadcast_to(np.zeros(modes) if redraw is None else np.asarray(redraw), (len(parts), modes)).astype(
+            np.float64
+        ),
     )
+
+
+def _padded(
+    lengths: NDArray[np.int64], indices: NDArray[np.int32], data: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]:
+    """Rows filled up to UNROLLED_WIDTH with entries of probability 0."""
+    at = np.arange(UNROLLED_WIDTH) < lengths[:, None]
+    wide_indices, wide_data = np.zeros(at.shape, dtype=np.int32), np.zeros(at.shape)
+    wide_indices[at], wide_data[at] = indices, data
+    return np.full(len(lengths), UNROLLED_WIDTH), wide_indices.ravel(), wide_data.ravel()
 
 
 def _check_rows(matrix: sparse.csr_array, name: str) -> None:
@@ -158,7 +244,8 @@ def run_and_tumble(
         mix[m, (m + 1) % headings] += turn / 2
     mix[headings, headings] = turn
     mix += (1 - events) * np.eye(modes)
-    mix += redraw * np.append(np.full(headings, (1 - REST_SHARE) / headings), REST_SHARE)
+    anew = np.append(np.full(headings, (1 - REST_SHARE) / headings), REST_SHARE)
+    mix += redraw * anew
     parts = []
     for speed in speeds:
         rows, columns, data = [], [], []
@@ -168,7 +255,7 @@ def run_and_tumble(
             columns.append(target * modes + m)
             data.append(share)
         parts.append(_gather(rows, columns, data, grid.cells * modes))
-    return from_matrices(parts, mix, np.append(angles, np.nan))
+    return from_matrices(parts, mix, np.append(angles, np.nan), np.full(modes, redraw), anew)
 
 
 def walk(grid: GridMap, metres_per_tick: ArrayLike, directions: int = 16) -> Reference:

@@ -51,7 +51,8 @@ def sample_paths(
     automaton_states[:, 0] = belief.automaton_states[slots]
     base_states[:, 0] = first
     completed_tick = np.empty(count, dtype=np.int32)
-    kernels.sample_paths(chain, rng.random((count, ticks)), automaton_states, base_states, completed_tick)
+    streams = rng.integers(0, 2**64, size=count, dtype=np.uint64)
+    kernels.sample_paths(chain, streams, automaton_states, base_states, completed_tick)
     cells, modes = np.divmod(base_states, np.int32(chain.modes))
     positions = chain.centres[cells]
     if jitter:

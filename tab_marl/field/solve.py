@@ -27,18 +27,19 @@ def solve(problem: FieldProblem) -> TabField:
     Exact on the product of cells and mission automaton (design, section 4). Raises InfeasibleField.
     """
     tilt = Tilt.of(problem)
-    chain = message(problem, tilt)
     flux: Floats | None = None
     error, rounds = 0.0, 1
-    if tilt.needed:
-        chains = [chain]
+    if not tilt.needed:
+        chain = message(problem, tilt)
+    else:
+        latest: list[ProductChain] = []
 
         def pass_both_ways(current: Tilt) -> Floats:
-            chains[0] = message(problem, current)
-            return expected_transitions(chains[0], problem.automaton.rank)
+            latest[:] = [message(problem, current)]
+            return expected_transitions(latest[0], problem.automaton.rank)
 
         flux, error, rounds = fit(tilt, pass_both_ways)
-        chain = chains[0]
+        chain = latest[0]
     return TabField(problem, chain, tilt, flux, error, rounds)
 
 
@@ -56,8 +57,8 @@ def message(problem: FieldProblem, tilt: Tilt) -> ProductChain:
     transient = np.setdiff1d(np.arange(count), [automaton.accepting, automaton.rejecting, automaton.initial])
     order = transient[np.argsort(-automaton.rank[transient], kind="stable")].astype(np.int32)
     kernels.backward(
-        order, motion.indptr, motion.indices, motion.data, motion.mix, problem.reference_of, problem.labels,
-        automaton.delta, weight, PEAK_SINGLE if single else 1.0, value, log_scale,
+        order, motion.motion, problem.reference_of, problem.labels, automaton.delta, weight,
+        PEAK_SINGLE if single else 1.0, value, log_scale,
     )  # fmt: skip
     # The initial state only reads the first label and is never left by a move; its scale is that of what follows.
     value[automaton.initial] = 0.0
