@@ -41,6 +41,8 @@ from tab_marl.world.scenario import UnknownName
 
 PLANNERS = ("S-POMCP", "FP-POMCP", "MLE-POMCP", "TAB-POMCP", "oracle", "population-POMCP", "random")
 
+ROLLOUTS_PER_POLICY = 30
+
 Rollouts = Callable[[Task, np.random.Generator], tuple[NDArray[np.float64], NDArray[np.int32]]]
 """Trajectories of a population that nobody hunts: positions ``[N, T + 1, 2]`` per tick, and completion ticks ``[N]``."""
 
@@ -237,8 +239,11 @@ def goal_places(task: Task) -> tuple[tuple[float, float], ...]:
 
 
 def zoo_rollouts(task: Task, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Trajectories of the zoo's policies in this task, unopposed."""
-    raise NotImplementedError("the zoo is not built yet")
+    """Trajectories of the shipped policies in this task, unopposed."""
+    from tab_marl.agents import rollouts
+    from tab_marl.agents.zoo import load_zoo
+
+    return rollouts.zoo_rollouts(load_zoo(), task, rng, ROLLOUTS_PER_POLICY)
 
 
 def make_planner(name: str, options: PlannerOptions | None = None) -> EgoAgent:

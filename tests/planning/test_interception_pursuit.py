@@ -4,6 +4,8 @@ import math
 
 import numpy as np
 import pytest
+from numba import njit
+
 from tab_marl.planning import pursuit_kernels
 from tab_marl.planning.interception import value_routes
 from tab_marl.planning.models.interface import SampledPaths
@@ -46,7 +48,7 @@ def test_steps_and_rollout_add_up_to_the_open_loop_return(macro_seconds: float) 
     values = value_routes(MAP.table(POSE, 40), sampled.positions, sampled.completed_tick, LAB.rewards, 0.3)
     candidates = np.array([0, 5, 17, 60, MAP.stay], dtype=np.int64)
     model = pursuit_model(MAP, POSE, sampled, values, candidates, options)
-    step, rollout, _ = model.functions()
+    step, rollout = njit(pursuit_kernels.step), njit(pursuit_kernels.rollout)
     outcomes = {"met": 0, "not met": 0}
     for a in range(len(candidates)):
         for k in range(40):
@@ -73,7 +75,7 @@ def test_macro_actions_stop_when_a_camera_begins_to_see() -> None:
     values = value_routes(MAP.table(POSE, 20), sampled.positions, sampled.completed_tick, LAB.rewards, 0.3)
     model = pursuit_model(MAP, POSE, sampled, values, np.array([MAP.stay]), PursuitOptions(macro_seconds=30.0))
     state = np.array([0.0, 0.0, *POSE])
-    seen, _reward, over = model.functions()[0](state, 0, model.data, np.zeros(1, dtype=np.uint64))
+    seen, _reward, over = njit(pursuit_kernels.step)(state, 0, model.data, np.zeros(1, dtype=np.uint64))
     entered = int(np.argmax(np.hypot(*(line - (camera.x, camera.y)).T) <= camera.camera_metres))
     assert seen != pursuit_kernels.UNSEEN and not over
     assert state[1] == entered
