@@ -147,7 +147,7 @@ class _Growing:
         if untried:
             return untried[stream.below(len(untried))]
         factor = exploration * math.sqrt(math.log(self.node_visits[node]))
-        return max(self.edges_of(node), key=lambda e: self.values[e] + factor / math.sqrt(self.edge_visits[e]))
+        return max(self.edges_of(node), key=lambda e: self.values[e] + factor * (1.0 / math.sqrt(self.edge_visits[e])))
 
     def find(self, edge: int, seen: Hashable) -> int:
         child = self.child[edge]

@@ -26,11 +26,17 @@ NODES, EDGES, DEEPEST, TREE_STEPS, ROLLOUT_STEPS = 0, 1, 2, 3, 4
 
 
 @njit(cache=True, nogil=True)
-def select(nodes, edges, node, exploration, rng):
-    """The edge to follow from an expanded node: an untried one at random, else the greatest upper bound (UCB1)."""
+def select(nodes, edges, node, exploration, root_log, inverse_root, rng):
+    """The edge to follow from an expanded node: an untried one at random, else the greatest upper bound (UCB1).
+
+    `root_log` and `inverse_root` [M] hold sqrt(log n) and 1 / sqrt(n) for n < M: roots and logarithms of small counts would
+    take a third of the search.
+    """
     first = nodes[node].first_edge
     count = nodes[node].edge_count
-    factor = exploration * math.sqrt(math.log(nodes[node].visits))
+    total = nodes[node].visits
+    known = len(inverse_root)
+    factor = exploration * (root_log[total] if total < known else math.sqrt(math.log(total)))
     untried = 0
     best = first
     best_score = -math.inf
@@ -39,7 +45,7 @@ def select(nodes, edges, node, exploration, rng):
         if visits == 0:
             untried += 1
         elif untried == 0:
-            score = edges[edge].value + factor / math.sqrt(visits)
+            score = edges[edge].value + factor * (inverse_root[visits] if visits < known else 1.0 / math.sqrt(visits))
             if score > best_score:
                 best_score = score
                 best = edge
@@ -112,7 +118,7 @@ def random_rollout(step, data, state, depth, max_depth, discount, actions, rng, 
 @njit(cache=True, nogil=True)
 def search(
     step, rollout, prior, data, states, particles, seeds, actions, exploration, discount, max_depth, tree_depth,
-    may_grow, nodes, edges, edge_actions, used, rng, model_rng, state, path_edges, path_rewards, values, counts,
+    may_grow, nodes, edges, edge_actions, used, root_log, inverse_root, rng, model_rng, state, path_edges, path_rewards, values, counts,
 ):  # fmt: skip
     """Simulations from `particles` [n] (rows of `states` [P, D]) until done or until the arrays are full and may grow.
 
@@ -139,7 +145,7 @@ def search(
                 # Every action is forbidden here (or the root has none): the leaf estimate stands for what follows.
                 leaf_needed = True
                 break
-            edge = select(nodes, edges, node, exploration, rng)
+            edge = select(nodes, edges, node, exploration, root_log, inverse_root, rng)
             action = np.int64(edge_actions[edge])
             if len(seeds) > 0:
                 model_rng[0] = mixed(seeds[particle] + np.uint64(depth) * GOLDEN)

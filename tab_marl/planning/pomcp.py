@@ -24,6 +24,9 @@ _CHUNK = 256
 """Simulations between two looks at the clock."""
 _FIRST_NODES = 16384
 """Nodes allocated at first; doubled when full."""
+_ROOT_LOG = np.sqrt([0.0, *(math.log(n) for n in range(1, 4096))])
+_INVERSE_ROOT = 1.0 / np.sqrt(np.maximum(np.arange(4096), 1))
+"""sqrt(log n) and 1 / sqrt(n) of small counts, for UCB1."""
 _PRECISION = 0.01
 """Without `max_depth`: the weight of a reward beyond the horizon."""
 
@@ -170,7 +173,11 @@ class Pomcp:
             allowed = open_actions if allowed is None else np.intersect1d(open_actions, _numbers(actions, allowed))
         root = _root(actions, allowed, prior_values, prior_counts)
         started = time.perf_counter()
-        if isinstance(self.model, CompiledModel) and self.options.compiled and not getattr(numba.config, "DISABLE_JIT", 0):
+        if (
+            isinstance(self.model, CompiledModel)
+            and self.options.compiled
+            and not getattr(numba.config, "DISABLE_JIT", 0)
+        ):
             tree, simulations, depth, steps = _grow_compiled(self.model, self.options, belief, generator, root)
         else:
             tree, simulations, depth, steps = grow_tree_in_python(self.model, self.options, belief, generator, root)
@@ -275,7 +282,7 @@ def _grow_compiled(
             run += kernels.search(
                 step, rollout, prior, model.data, states, particles[run:], seeds, actions,
                 options.exploration, options.discount, horizon, _tree_depth(options), len(nodes) < most,
-                nodes, edges, edge_actions, used, tree_stream, model_stream, state, path_edges, path_rewards, values, counts,
+                nodes, edges, edge_actions, used, _ROOT_LOG, _INVERSE_ROOT, tree_stream, model_stream, state, path_edges, path_rewards, values, counts,
             )  # fmt: skip
             if run < chunk:
                 size = min(most, 2 * len(nodes))
