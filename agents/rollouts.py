@@ -36,10 +36,12 @@ class Rollouts:
     """``[N]`` via points reached."""
     dropped: NDArray[np.bool_]
     """``[N]`` whether the style was dropped for lack of time."""
+    places: tuple[tuple[str, ...], ...]
+    """Per episode the places of the counted visits, in order."""
 
 
 def run_bank(
-    policy: AdversaryPolicy, bank: Bank, tasks: NDArray[np.int64], rng: np.random.Generator, settle_seconds: float = 0.0
+    policy: AdversaryPolicy, bank: Bank, tasks: NDArray[np.int64], rng: np.random.Generator
 ) -> Rollouts:
     """One episode of the policy on each of these tasks of the bank, side by side, until all have ended."""
     n = len(tasks)
@@ -53,9 +55,15 @@ def run_bank(
     end = np.full(n, -1, dtype=np.int64)
     touches = np.zeros(n, dtype=np.int64)
     vias = np.zeros(n, dtype=np.int64)
+    places: list[list[str]] = [[] for _ in range(n)]
     last = 0
     for step in range(1, steps + 1):
+        before = world.location.copy()
         world.step(policy.act(world.observation))
+        for i in np.flatnonzero(world.visited):
+            automaton = bank.tasks[int(tasks[i])].automaton
+            branch = automaton.branch[before[i], int(automaton.masks(world.state[i, :2])[0])]
+            places[i].append(automaton.branch_places[branch] if branch >= 0 else "")
         positions[:, step] = world.state[:, :2]
         touches += world.touched
         np.maximum(vias, world.memory[:, 0], out=vias)
@@ -66,7 +74,14 @@ def run_bank(
             break
     end[end < 0] = last
     return Rollouts(
-        tasks, positions[:, : last + 1], world.completed.copy(), end, touches, vias, world.memory[:, 1].astype(bool)
+        task=tasks,
+        positions=positions[:, : last + 1],
+        completed=world.completed.copy(),
+        end=end,
+        touches=touches,
+        via_passed=vias,
+        dropped=world.memory[:, 1].astype(bool),
+        places=tuple(tuple(visited) for visited in places),
     )
 
 

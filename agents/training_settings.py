@@ -32,7 +32,7 @@ class TrainingSettings:
     tasks: int = 360
     """Scenario x mission x latents draws in the bank."""
     seed: int = 0
-    steps: int = 1_600_000
+    steps: int = 1_000_000
     """Control steps over all robots."""
     robots: int = 64
     rollout_steps: int = 128

@@ -1,0 +1,218 @@
+"""What a policy does when nobody hunts it: success on held-out tasks, in both worlds, and the figures of its style.
+
+A style counts only if its *own* figure moves against direct policies trained with other seeds on the same tasks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tab_marl.agents.adversaries import AdversaryPolicy
+from tab_marl.agents.rollouts import Rollouts, run_bank
+from tab_marl.agents.training_env import HELD_OUT, build_bank, draw_tasks
+from tab_marl.agents.zoo import MissionRecord
+from tab_marl.envs.adversary_kernels import VIA_METRES
+from tab_marl.envs.adversary_observation import AdversaryTask
+from tab_marl.envs.batched import Bank
+from tab_marl.envs.intercept import ADVERSARY_AGENT, EGO_AGENT, InterceptEnv
+from tab_marl.mission.automaton import UNBOUNDED
+from tab_marl.mission.tasks import Task
+from tab_marl.world.grid import GridMap
+
+BATCHED, PHYSICS = "batched", "physics"
+WINDING_RADIANS = 0.3
+"""A way that turns less than this about the arena's centre takes neither side."""
+SPREAD_POINTS = 21
+NEVER_MET_METRES = 1e-3
+
+
+def wilson(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
+    """Wilson's interval of a share (Wilson 1927), 95 % by default. Raises ValueError without trials."""
+    if not 0 <= successes <= trials or trials < 1:
+        raise ValueError(f"{successes} successes of {trials} trials: need 0 <= successes <= trials, trials >= 1")
+    share, n = successes / trials, trials
+    centre = (share + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Tasks that no training run has seen."""
+
+    tasks: tuple[Task, ...]
+    seed: int
+
+    @classmethod
+    def draw(cls, count: int, seed: int = 99, missions: Sequence[str] = ("M1", "M2", "M3", "M4", "M5")) -> HeldOut:
+        """`count` tasks, missions and families in turn."""
+        return cls(tuple(draw_tasks(HELD_OUT, seed, count, missions, ("point", "ambiguous", "perimeter"))), seed)
+
+    def bank(self, policy: AdversaryPolicy, draw: int = 0) -> Bank:
+        """The tasks under the policy's style; another `draw`, other latents."""
+        return build_bank(self.tasks, policy.style, 1000 * self.seed + draw)
+
+    @property
+    def missions(self) -> NDArray[np.str_]:
+        return np.array([task.mission_id for task in self.tasks])
+
+
+def mission_records(missions: NDArray[np.str_], completed: NDArray[np.bool_], world: str) -> list[MissionRecord]:
+    """Success per mission type with its interval."""
+    records = []
+    for mission in sorted({str(m) for m in missions}):
+        of_mission = completed[missions == mission]
+        done, n = int(of_mission.sum()), len(of_mission)
+        low, high = wilson(done, n)
+        records.append(
+            MissionRecord(
+                mission=mission, world=world, completed=done, episodes=n, low=round(low, 4), high=round(high, 4)
+            )
+        )
+    return records
+
+
+def play_physics(
+    policy: AdversaryPolicy, tasks: Sequence[Task], seed: int, on_played: Callable[[int, int], None] | None = None
+) -> NDArray[np.bool_]:
+    """``[N]`` whether the policy completed each task in the physics environment, the ego parked out of its way."""
+    completed = np.zeros(len(tasks), dtype=bool)
+    for i, task in enumerate(tasks):
+        # The ego stays far off and cannot meet anybody: only the adversary and its mission are tested.
+        unopposed = replace(task, scenario=replace(task.scenario, interception_metres=NEVER_MET_METRES))
+        env = InterceptEnv(unopposed, adversary_style=policy.style, end_on_completion=True)
+        observations, _ = env.reset(seed=seed + i, options={"ego_start": (*_parking(task), 0.0)})
+        policy.reset(unopposed, np.random.default_rng((seed, i)))
+        still = np.array([-1.0, 0.0], dtype=np.float32)
+        while env.agents:
+            action = policy.act(observations[ADVERSARY_AGENT])
+            observations, *_ = env.step({EGO_AGENT: still, ADVERSARY_AGENT: action})
+        completed[i] = env.episode.monitor.status == "completed"
+        if on_played is not None:
+            on_played(i + 1, len(tasks))
+    return completed
+
+
+def _parking(task: Task) -> tuple[float, float]:
+    """The free point farthest from every place of the mission and from the adversary's start."""
+    scenario = task.scenario
+    grid = GridMap.from_scenario(scenario, 0.1, scenario.ego.radius_metres + 0.02)
+    centres = [scenario.adversary_start.centre]
+    for constraint in task.mission.constraints:
+        for place in constraint.places:
+            centres.append(scenario.region(place).centre if isinstance(place, str) else place)
+    gaps = np.min([np.hypot(*(grid.centres - c).T) for c in centres], axis=0)
+    x, y = grid.centres[int(np.argmax(gaps))]
+    return float(x), float(y)
+
+
+def style_figures(bank: Bank, rollouts: Rollouts, again: Rollouts | None = None) -> dict[str, float]:
+    """The figures that styles move, over completed episodes; nan where nothing of the kind was drawn.
+
+    `bank` says what was drawn (side, via points); the rollouts may be those of a control on its own bank of the same
+    tasks in the same order. `again`: other draws on the same tasks, for the spread.
+    """
+    done = np.flatnonzero(rollouts.completed)
+    tasks = [bank.tasks[int(rollouts.task[i])] for i in range(len(rollouts.task))]
+    figures = {
+        "side taken as drawn": _mean([_side_match(tasks[i], _path(rollouts, i)) for i in done]),
+        "via points reached": _mean([_via_reached(tasks[i], _path(rollouts, i)) for i in done]),
+        "seconds in cameras": _mean([_camera_seconds(tasks[i], _path(rollouts, i)) for i in done]),
+        "time used / allowed": _mean([_time_share(tasks[i], int(rollouts.end[i])) for i in done]),
+        "length / shortest": _mean([_stretch(tasks[i], _path(rollouts, i)) for i in done]),
+        "touches per episode": float(rollouts.touches.mean()),
+    }
+    if again is not None:
+        both = np.flatnonzero(rollouts.completed & again.completed)
+        figures["spread between episodes, metres"] = _mean([_spread(_path(rollouts, i), _path(again, i)) for i in both])
+    return figures
+
+
+def other_places(rollouts: Rollouts, reference: Rollouts) -> float:
+    """Share of episodes whose visited places differ from the reference's on the same task, where they could differ."""
+    pairs = [
+        mine != theirs for mine, theirs, both in zip(
+            rollouts.places, reference.places, rollouts.completed & reference.completed, strict=True
+        ) if both
+    ]  # fmt: skip
+    return _mean([float(differ) for differ in pairs])
+
+
+def _path(rollouts: Rollouts, i: int) -> NDArray[np.float64]:
+    return rollouts.positions[i, : rollouts.end[i] + 1].astype(np.float64)
+
+
+def _mean(values: Sequence[float]) -> float:
+    known = [v for v in values if not math.isnan(v)]
+    return float(np.mean(known)) if known else math.nan
+
+
+def _side_match(task: AdversaryTask, path: NDArray[np.float64]) -> float:
+    if task.latents.side == 0 or task.strength == 0:
+        return math.nan
+    x, y = path.T - [[task.scenario.width_metres / 2], [task.scenario.height_metres / 2]]
+    winding = float(np.diff(np.unwrap(np.arctan2(y, x))).sum())
+    return math.nan if abs(winding) < WINDING_RADIANS else float(np.sign(winding) == task.latents.side)
+
+
+def _via_reached(task: AdversaryTask, path: NDArray[np.float64]) -> float:
+    if len(task.parts.via) == 0:
+        return math.nan
+    return float(all((np.hypot(*(path - point).T) <= VIA_METRES).any() for point in task.parts.via))
+
+
+def _camera_seconds(task: AdversaryTask, path: NDArray[np.float64]) -> float:
+    return float(task.scenario.seen(path).sum()) / task.scenario.control_hertz
+
+
+def _time_share(task: AdversaryTask, end: int) -> float:
+    allowed = allowed_seconds(task)
+    return math.nan if math.isinf(allowed) else end / task.scenario.control_hertz / allowed
+
+
+def _stretch(task: AdversaryTask, path: NDArray[np.float64]) -> float:
+    plain = task.parts.plain
+    return float(np.hypot(*np.diff(path, axis=0).T).sum()) / float(plain.metres(task.parts.via_home, path[0])[0])
+
+
+def _spread(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+    """Mean distance in metres between two paths at equal shares of their lengths."""
+    shares = np.linspace(0, 1, SPREAD_POINTS)
+    points = []
+    for path in (first, second):
+        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+        points.append(np.stack([np.interp(shares * along[-1], along, path[:, k]) for k in (0, 1)], axis=1))
+    return float(np.hypot(*(points[0] - points[1]).T).mean())
+
+
+def allowed_seconds(task: AdversaryTask) -> float:
+    """The most time that the mission allows along its plain route; inf if nothing but the horizon of others bounds it."""
+    automaton, tick = task.automaton, task.automaton.tick_seconds
+    route = task.parts.plain
+    cells, locations = route.path(task.parts.via_home, task.scenario.adversary_start.centre)
+    masks = automaton.masks(route.grid.centres[cells])
+    allowed = 0.0
+    for i in range(len(cells) - 1):
+        u = int(locations[i])
+        if not automaton.progress[u, masks[i + 1]] or locations[i + 1] == u:
+            continue
+        latest = automaton.latest[u]
+        if latest[0] < UNBOUNDED:
+            allowed = float(latest[0]) * tick
+        elif min(latest[1:]) < UNBOUNDED:
+            allowed += float(min(latest[1:])) * tick
+        else:
+            allowed = task.scenario.horizon_seconds
+    return allowed or math.inf
+
+
+def run_held_out(policy: AdversaryPolicy, held_out: HeldOut, draw: int = 0) -> tuple[Bank, Rollouts]:
+    """One unopposed episode per held-out task in the batched world."""
+    bank = held_out.bank(policy, draw)
+    rng = np.random.default_rng((held_out.seed, draw))
+    return bank, run_bank(policy, bank, np.arange(len(bank)), rng)
