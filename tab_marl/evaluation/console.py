@@ -12,9 +12,45 @@ from tab_marl.evaluation.paper import PAPER
 from tab_marl.evaluation.rows import EpisodeRow
 from tab_marl.evaluation.settings import HEADLINE
 from tab_marl.evaluation.statistics import Interval, Paired, stars
+from tab_marl.evaluation.tables import Line
 
-WIDTH = 118
-"""Columns when the output is not a terminal."""
+WIDTH = 132
+"""Columns that the whole table needs, and that are used when the output is not a terminal."""
+
+
+def _table(title: str, part: Sequence[Line], columns: Sequence[str]) -> Table:
+    table = Table(title=title, title_justify="left", pad_edge=False, box=None, show_edge=False)
+    for heading in columns:
+        table.add_column(heading, justify="left" if heading in MEASURED[:2] else "right", no_wrap=True)
+    mission = None
+    for line in part:
+        if mission is not None and line.mission != mission:
+            table.add_section()
+        cells = _cells(line)
+        chosen = [cells[heading] if heading != "paper" else "" for heading in columns]
+        for i, heading in enumerate(columns):
+            if heading == "paper":
+                chosen[i] = cells[f"paper {columns[i - 1]}"]
+        if line.mission == mission:
+            chosen[0] = ""
+        table.add_row(*chosen, style="bold" if line.planner == HEADLINE else None)
+        mission = line.mission
+    return table
+
+
+def _cells(line: Line) -> dict[str, str]:
+    figure = PAPER.get((line.mission, line.planner)) if line.family == "point" else None
+    return {
+        "": line.mission,
+        "planner": line.planner.removesuffix("-POMCP"),
+        "n": f"{line.episodes}" + (f" ({line.errors} failed)" if line.errors else ""),
+        MEASURED[3]: percent(line.atcr),
+        f"paper {MEASURED[3]}": f"{figure.atcr_percent:.1f}" if figure else "",
+        MEASURED[5]: steps(line.steps),
+        f"paper {MEASURED[5]}": f"{figure.steps}" if figure else "",
+        PAIRED[0]: difference(line.atcr_against_headline, 100.0),
+        PAIRED[1]: difference(line.steps_against_headline, 1.0),
+    }
 
 
 def percent(interval: Interval) -> str:
@@ -33,43 +69,24 @@ def difference(paired: Paired | None, scale: float) -> str:
     return f"{scale * d.value:+.0f} [{scale * d.low:+.0f}, {scale * d.high:+.0f}] p {stars(paired.p_value)}"
 
 
+MEASURED = ("", "planner", "n", "ATCR % [95 %]", "paper", "StI [95 %]", "paper")
+PAIRED = ("ATCR - TAB, points", "StI - TAB, steps")
+
+
 def print_tables(rows: Sequence[EpisodeRow], console: Console) -> None:
-    """One table per family: ATCR and StI with intervals, the paper's figures, paired differences against TAB-POMCP."""
+    """Per family: ATCR and StI with intervals, the paper's figures, paired differences against TAB-POMCP.
+
+    On a narrow terminal the differences follow in a table of their own.
+    """
     found = tables.lines(rows)
+    whole = console.width >= WIDTH
     for family in dict.fromkeys(line.family for line in found):
-        table = Table(title=f"family: {family}", title_justify="left", pad_edge=False, box=None, show_edge=False)
-        for heading in (
-            "",
-            "planner",
-            "n",
-            "ATCR % [95 %]",
-            "paper",
-            "StI [95 %]",
-            "paper",
-            "ATCR - TAB, points",
-            "StI - TAB, steps",
-        ):
-            table.add_column(heading, justify="left" if heading in ("", "planner") else "right", no_wrap=True)
-        mission = None
-        for line in (line for line in found if line.family == family):
-            if mission is not None and line.mission != mission:
-                table.add_section()
-            figure = PAPER.get((line.mission, line.planner)) if family == "point" else None
-            table.add_row(
-                line.mission if line.mission != mission else "",
-                line.planner,
-                f"{line.episodes}" + (f" ({line.errors} failed)" if line.errors else ""),
-                percent(line.atcr),
-                f"{figure.atcr_percent:.1f}" if figure else "",
-                steps(line.steps),
-                f"{figure.steps}" if figure else "",
-                difference(line.atcr_against_headline, 100.0),
-                difference(line.steps_against_headline, 1.0),
-                style="bold" if line.planner == HEADLINE else None,
-            )
-            mission = line.mission
-        console.print(table)
+        part = [line for line in found if line.family == family]
+        console.print(_table(f"family: {family}", part, MEASURED + (PAIRED if whole else ())))
         console.print()
+        if not whole and any(line.atcr_against_headline for line in part):
+            console.print(_table(f"family: {family}, paired differences", part, MEASURED[:2] + PAIRED))
+            console.print()
     console.print(
         "ATCR: episodes in which the adversary completed its mission before interception (lower is better). "
         "StI: 100 Hz physics steps to interception, censored at the horizon.\n"

@@ -8,12 +8,13 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tab_marl.agents.adversaries import AdversaryPolicy
 from tab_marl.agents.planners import EgoAgent, PlannerOptions, make_planner
+from tab_marl.agents.zoo import load_zoo
 from tab_marl.envs.intercept_v0 import parallel_env
 from tab_marl.evaluation.errors import Interrupted
 from tab_marl.evaluation.replay import Trace, shrink
@@ -23,14 +24,11 @@ from tab_marl.evaluation.units import Job, unit_seeds
 from tab_marl.field.problem import FieldOptions
 from tab_marl.mission.tasks import Task, ego_can_be_first, sample_task
 
+ADVERSARY_STREAM = 1
+"""Separates the adversary's own draws from the environment's, which have the same seed."""
 
-class Policy(Protocol):
-    """An adversary, as the zoo gives it."""
-
-    name: str
-    style: Any
-
-    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]: ...
+WARM_STEPS = 11
+"""Control steps: three decisions."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +43,7 @@ class Played:
 def run_episode(
     task: Task,
     planner: EgoAgent,
-    policy: Policy,
+    policy: AdversaryPolicy,
     seed: int,
     trace: bool = False,
     index: int = 0,
@@ -53,18 +51,20 @@ def run_episode(
     should_stop: Callable[[], bool] = stop_requested,
     on_step: Callable[[Any], None] | None = None,
     render_mode: str | None = None,
+    max_steps: int | None = None,
 ) -> Played:
     """Play one episode to interception or the horizon.
 
     `seed` decides the environment's draws (starts, the adversary's habits), `planner_seed` the planner's (default:
     `seed`), `index` is what the row is filed under. `on_step` is called with the environment after reset and every
-    step. Raises Interrupted if `should_stop` says so.
+    step, `max_steps` cuts the episode short. Raises Interrupted if `should_stop` says so.
     """
     env = parallel_env(
         task=task,
         adversary_style=policy.style,
         full_observation=planner.full_observation,
         render_mode=render_mode,
+        max_cycles=max_steps,
     )
     began = time.perf_counter()
     scenario = task.scenario
@@ -73,6 +73,7 @@ def run_episode(
     try:
         observations, _ = env.reset(seed=seed)
         planner.reset(task, np.random.default_rng(seed if planner_seed is None else planner_seed))
+        policy.reset(task, np.random.default_rng(np.random.SeedSequence([seed, ADVERSARY_STREAM])))
         failed = False
         step = 0
         while True:
@@ -169,12 +170,23 @@ def play_unit(job: Job, trace: bool = False) -> list[Played]:
             if job.learned is not None:
                 planner.restore(json.loads(job.learned))
             policy = zoo()[job.adversary]
+            _warm(name, task, policy)
             played.append(run_episode(task, planner, policy, episode_seed, trace, job.unit.seed, planner_seed))
         except (Interrupted, MemoryError):
             raise
         except Exception as error:  # noqa: BLE001, whatever broke becomes part of the record
             played.append(_broken(job, name, task, error, time.perf_counter() - began))
     return played
+
+
+_warmed: set[str] = set()
+
+
+def _warm(planner: str, task: Task, policy: AdversaryPolicy) -> None:
+    """Play the first moments of a throw-away episode, once per process: loading compiled kernels is no decision time."""
+    if planner not in _warmed:
+        _warmed.add(planner)
+        run_episode(task, make_planner(planner), policy, seed=0, max_steps=WARM_STEPS)
 
 
 def _broken(job: Job, planner: str, task: Task | None, error: Exception, seconds: float) -> Played:
@@ -198,10 +210,8 @@ def _broken(job: Job, planner: str, task: Task | None, error: Exception, seconds
 
 
 @lru_cache(maxsize=1)
-def zoo() -> dict[str, Policy]:
+def zoo() -> dict[str, AdversaryPolicy]:
     """The shipped policies by name."""
-    from tab_marl.agents.zoo import load_zoo
-
     return {policy.name: policy for policy in load_zoo()}
 
 

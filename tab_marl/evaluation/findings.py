@@ -25,6 +25,10 @@ def findings(lines: Sequence[Line]) -> list[tuple[str, list[str]]]:
         ]
         if headline is not None and rivals:
             found.append((family.capitalize(), [_completion(headline, rivals), _interception(headline, rivals)]))
+    if not found:
+        found.append(
+            ("No verdict", ["These rows hold no comparison with TAB-POMCP; the tables show what was measured."])
+        )
     counts = [line.episodes for line in lines if line.mission != ALL]
     if counts and min(counts) < FEW:
         text = (

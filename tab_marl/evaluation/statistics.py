@@ -53,12 +53,7 @@ def bootstrap_mean(values: ArrayLike, strata: Sequence[object] | None = None) ->
     percentile interval exists for every sample.
     """
     data = np.asarray(values, dtype=np.float64)
-    labels = (
-        np.zeros(len(data), dtype=int)
-        if strata is None
-        else np.unique(np.array([str(s) for s in strata]), return_inverse=True)[1]
-    )
-    groups = [data[labels == g] for g in range(int(labels.max()) + 1)] if len(data) else []
+    groups = _groups(data, strata)
     if not groups:
         raise ValueError("a bootstrap needs at least one value")
     rng = np.random.default_rng(_SEED)
@@ -71,15 +66,26 @@ def bootstrap_mean(values: ArrayLike, strata: Sequence[object] | None = None) ->
     return Interval(value, min(float(low), value), max(float(high), value), len(data))
 
 
+def _groups(data: Floats, strata: Sequence[object] | None) -> list[Floats]:
+    if not len(data):
+        return []
+    if strata is None:
+        return [data]
+    _, labels = np.unique(np.array([str(s) for s in strata]), return_inverse=True)
+    return [data[labels == g] for g in range(int(labels.max()) + 1)]
+
+
 def share(successes: ArrayLike, strata: Sequence[object] | None = None) -> Interval:
-    """Bootstrap interval of a share; where all or none succeed, the exact (Clopper-Pearson) one.
+    """Bootstrap interval of a share; where all or none succeed (in every stratum), the exact (Clopper-Pearson) one.
 
     A bootstrap of 150 zeros says [0, 0]; what 150 zeros really say is [0, 2.4 %].
     """
     data = np.asarray(successes, dtype=np.float64)
-    if len(data) and (np.all(data == 0) or np.all(data == 1)):
+    groups = _groups(data, strata)
+    if groups and all(np.all(group == group[0]) for group in groups):
         bound = stats.binomtest(int(data.sum()), len(data)).proportion_ci(CONFIDENCE, method="exact")
-        return Interval(float(data[0]), float(bound.low), float(bound.high), len(data), exact=True)
+        value = float(np.mean([group[0] for group in groups]))
+        return Interval(value, min(value, float(bound.low)), max(value, float(bound.high)), len(data), exact=True)
     return bootstrap_mean(data, strata)
 
 

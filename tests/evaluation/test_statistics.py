@@ -42,6 +42,8 @@ def test_no_spread_is_not_certainty():
     assert none.high == pytest.approx(1 - 0.025 ** (1 / 150))  # Clopper-Pearson at zero successes
     every = statistics.share([True] * 20)
     assert every.low == pytest.approx(0.025 ** (1 / 20)) and every.high == 1
+    halves = statistics.share([True] * 4 + [False] * 4, ["a"] * 4 + ["b"] * 4)
+    assert halves.exact and halves.value == 0.5 and halves.low < 0.2 and halves.high > 0.8
 
 
 def test_paired_shares_is_mcnemar_on_the_pairs_that_differ():

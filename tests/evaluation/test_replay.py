@@ -1,0 +1,72 @@
+"""Replays: an honest choice, and an encoding that the page can read back."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tab_marl.evaluation import replay
+from tab_marl.world.scenario import Scenario
+
+
+def test_encoded_image_reads_back():
+    rng = np.random.default_rng(0)
+    for image in (rng.random((30, 30)) ** 8, np.zeros((3, 5)), np.ones((20, 20)), rng.random((1, 1))):
+        back = replay.decode_image(replay.encode_image(image), image.shape)
+        assert np.array_equal(back, replay.quantised(image))
+    assert replay.quantised(np.array([[0.0, 1.0, 4.0, np.nan]])).tolist() == [[0, 8, 15, 0]]
+
+
+def test_shrink_keeps_the_mass_in_place():
+    image = np.zeros((60, 60))
+    image[10, 50] = 0.7
+    image[11, 51] = 0.3
+    small = replay.shrink(image, 3.0, 3.0)
+    assert small.shape == (30, 30)
+    assert small[5, 25] == pytest.approx(1.0) and small.sum() == pytest.approx(1.0)
+    assert replay.shrink(image[:20, :20], 3.0, 3.0).shape == (20, 20)
+
+
+def test_trace_is_json(synthetic):
+    trace = replay.Trace(10, [(0.5, 1.0, 3.14159, 2.0, 2.5, -1.0, True)], [(0, np.eye(3))], [(1.23456, "intercepted")])
+    back = json.loads(json.dumps(replay.encode_trace(trace), allow_nan=False))
+    assert back["poses"] == [[500], [1000], [314], [2000], [2500], [-100]]
+    assert back["seen"] == "1" and back["events"] == [[1.23, "intercepted"]]
+
+
+def test_map_holds_what_is_drawn():
+    scenario = Scenario.preset("lab")
+    drawn = replay.encode_map(scenario, [scenario.region("Checkpoint A")], [scenario.region("left half")])
+    assert [c["label"] for c in drawn["checkpoints"]] == list("ABCDE")
+    assert drawn["goals"] == [["disc", 0.5, 2.5, 0.18]]
+    assert drawn["forbidden"] == [["box", 0, 0, 1.5, 3.0]]
+
+
+def rows_of(synthetic, outcomes):
+    """{(mission, family): [per seed (TAB's steps, S's steps)]}; 0 means completed and never met."""
+    return [
+        synthetic.row(p, seed, mission, family, steps > 0, steps == 0, steps)
+        for (mission, family), seeds in outcomes.items()
+        for seed, pair in enumerate(seeds)
+        for p, steps in zip(("TAB-POMCP", "S-POMCP"), pair, strict=True)
+    ]
+
+
+def test_choice_is_typical_not_flattering(synthetic):
+    rows = rows_of(synthetic, {("M1", "ambiguous"): [(10, 0), (300, 900), (310, 1000), (320, 1100), (4000, 4000)]})
+    (first,) = replay.choose(rows, 1)
+    assert first.unit.seed in (1, 2, 3)
+    assert "typical" in first.why
+
+
+def test_a_defeat_is_shown_too(synthetic):
+    rows = rows_of(synthetic, {("M1", "ambiguous"): [(300, 900), (310, 910), (0, 500)], ("M2", "point"): [(100, 200)]})
+    chosen = replay.choose(rows, 3)
+    assert [c.unit.family for c in chosen] == ["ambiguous", "point", "ambiguous"]
+    assert chosen[2].unit.seed == 2 and "lost" in chosen[2].why
+    assert len({c.unit for c in replay.choose(rows, 30)}) == len(replay.choose(rows, 30))
+
+
+def test_nothing_to_choose_from(synthetic):
+    assert replay.choose([], 3) == []
+    assert replay.choose([synthetic.row(error="x")], 3) == []

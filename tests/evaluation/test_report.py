@@ -1,0 +1,224 @@
+"""The page: complete, self-contained, safe against what stands in the rows, and readable without colour or script."""
+
+import itertools
+import json
+import re
+import xml.etree.ElementTree as ET
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from tab_marl.evaluation import charts, figures, replay, report, settings
+from tab_marl.evaluation.errors import UserError
+from tab_marl.evaluation.report import ReportData
+from tab_marl.evaluation.statistics import Interval
+from tab_marl.evaluation.units import Job, Unit
+from tab_marl.world.scenario import Scenario
+
+VOID = {"meta", "link", "input", "br", "img"}
+
+
+class Outline(HTMLParser):
+    """Collects what a browser would load and checks that elements nest."""
+
+    def __init__(self):
+        super().__init__()
+        self.stack, self.ids, self.links, self.loads, self.text = [], [], [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        attrs = dict(attrs)
+        self.ids += [attrs["id"]] if "id" in attrs else []
+        self.links += [attrs["href"]] if tag == "a" else []
+        self.loads += [attrs[k] for k in ("src", "href", "data", "srcset", "poster") if k in attrs and tag != "a"]
+        if tag not in VOID:
+            self.stack.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self.stack.pop()
+
+    def handle_endtag(self, tag):
+        assert self.stack and self.stack[-1] == tag, f"</{tag}> closes {self.stack[-3:]}"
+        self.stack.pop()
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def outline(page):
+    found = Outline()
+    found.feed(page)
+    found.close()
+    assert found.stack == []
+    return found
+
+
+def replays():
+    trace = replay.Trace(10)
+    trace.poses = [(0.5 + 0.01 * k, 1.0, 0.0, 2.0, 2.0 - 0.01 * k, 1.0, k > 5) for k in range(20)]
+    trace.beliefs = [(k, np.eye(30)) for k in range(0, 20, 5)]
+    trace.events = [(1.5, "intercepted")]
+    episodes = [
+        {
+            "planner": p,
+            "outcome": "met </script><script>alert(1)</script>",
+            "note": "",
+            "trace": replay.encode_trace(trace),
+        }
+        for p in ("S-POMCP", "TAB-POMCP")
+    ]
+    drawn = replay.encode_map(Scenario.preset("lab"))
+    return [{"title": "M1, point", "about": "about", "why": "why", "map": drawn, "episodes": episodes}]
+
+
+@pytest.fixture
+def data(synthetic):
+    chosen = settings.EvaluationSettings(missions=("M1", "M5"), families=("point", "ambiguous"), episodes=8)
+    rows, timings = [], {}
+    for mission in chosen.missions:
+        for family in chosen.families:
+            for seed in range(chosen.episodes):
+                job = Job(Unit(mission, family, seed), chosen.planners, 1, None, ("direct", "<b>late</b>"), "default")
+                for row, timing in synthetic.play(job):
+                    rows.append(row)
+                    timings[row.key] = timing
+    broken = synthetic.row("MLE-POMCP", 99, error="ValueError: <script>alert(2)</script>", intercepted=False)
+    rows.append(broken)
+    return ReportData(
+        rows, timings, {"seed": 1}, "abc123", replays(), {"map": "<svg></svg>", "map_text": "t"}, [], "1.0"
+    )
+
+
+def test_page_is_whole_and_loads_nothing(data):
+    page = report.render(data)
+    found = outline(page)
+    assert len(found.ids) == len(set(found.ids))
+    for link in found.links:
+        assert link.startswith("#") and link[1:] in found.ids, link
+    assert all(load.startswith("data:") for load in found.loads)
+    assert not re.search(r"https?://(?!www\.w3\.org/)", page)
+    assert "default-src 'none'" in page
+    text = " ".join(found.text)
+    for expected in ("ATCR", "StI", "TAB-POMCP", "13.3", "545", "TAB-Field", "maximum entropy", "bootstrap", "abc123"):
+        assert expected in text
+
+
+def test_rows_cannot_smuggle_markup(data):
+    page = report.render(data)
+    assert "<script>alert" not in page and "<b>late" not in page
+    assert "&lt;b&gt;late" in page
+    embedded = re.search(r'<script type="application/json" id="replays">(.*?)</script>', page, re.DOTALL)[1]
+    assert json.loads(embedded)[0]["episodes"][0]["outcome"].startswith("met </script>")
+
+
+def test_a_page_of_little(synthetic):
+    rows = [synthetic.row("random", 0)]
+    page = report.render(ReportData(rows, {}, {}, "k"))
+    outline(page)
+    assert "no comparison with TAB-POMCP" in page and 'id="replays"' not in page
+
+
+def test_broken_episodes_are_shown(data):
+    text = " ".join(outline(report.render(data)).text)
+    assert "1 episodes broke down" in text and "ValueError: <script>" in text
+
+
+def test_report_that_cannot_be_written(data, tmp_path):
+    with pytest.raises(UserError, match="episodes are safe"):
+        report.write_report(data, tmp_path / "missing" / "report.html")
+    report.write_report(data, tmp_path / "report.html")
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_every_plot_is_xml_and_keeps_inside_its_box():
+    dots = [charts.Dot(p, Interval(0.2, 0.1, 0.9, 50), 13.3) for p in settings.PLANNERS]
+    curves = {p: np.linspace(0, 0.3 + 0.1 * i, 10) for i, p in enumerate(settings.PLANNERS)}
+    for svg in (charts.interval_plot(dots, 100, "u", 'a "title" & more', 100), charts.curve_plot(curves, "t")):
+        tree = ET.fromstring(svg)
+        _, _, width, height = (float(v) for v in tree.get("viewBox").split())
+        for node in tree.iter():
+            for name, limit in (
+                ("x", width),
+                ("x1", width),
+                ("x2", width),
+                ("cx", width),
+                ("y", height),
+                ("cy", height),
+            ):
+                if name in node.attrib:
+                    assert 0 <= float(node.get(name)) <= limit, (node.tag, node.attrib)
+
+
+def test_interval_is_drawn_to_scale():
+    tree = ET.fromstring(
+        charts.interval_plot([charts.Dot("TAB-POMCP", Interval(0.5, 0.25, 1.0, 9))], 100, "u", "t", 100)
+    )
+    (line,) = [n for n in tree.iter() if n.get("class") == "whisker"]
+    (dot,) = [n for n in tree.iter() if n.get("class") == "mark"]
+    x0, x1 = float(line.get("x1")), float(line.get("x2"))
+    span = charts.WIDTH - charts.LABELS - charts.RIGHT
+    assert x1 == pytest.approx(charts.LABELS + span, abs=0.1)
+    assert x1 - x0 == pytest.approx(0.75 * span, abs=0.1)
+    assert float(dot.get("cx")) == pytest.approx(charts.LABELS + 0.5 * span, abs=0.1)
+
+
+def test_labels_are_spread():
+    placed = charts.spread_labels({"a": 50, "b": 51, "c": 52, "d": 200}, 13, 0, 210)
+    heights = sorted(placed.values())
+    assert all(b - a >= 13 for a, b in itertools.pairwise(heights))
+    assert placed["a"] < placed["b"] < placed["c"] < placed["d"] == 200
+
+
+def test_planners_differ_by_shape_not_colour_alone():
+    shapes = {
+        re.sub(r"class=\"[^\"]*\"", "", charts.mark(p, 0, 0)) + str("hollow" in charts.mark(p, 0, 0))
+        for p in settings.PLANNERS
+    }
+    assert len(shapes) == len(settings.PLANNERS)
+
+
+def contrast(first, second):
+    def luminance(colour):
+        channels = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+        r, g, b = (c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in channels)
+        return 0.2126 * r + 0.7152 * g + 0.0722 * b
+
+    a, b = sorted((luminance(first), luminance(second)))
+    return (b + 0.05) / (a + 0.05)
+
+
+def test_text_has_contrast_in_light_and_dark():
+    css = report._template("report.css")
+    themes = [
+        dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", block)) for block in re.findall(r"\{[^{}]*--page:[^{}]*\}", css)
+    ]
+    assert len(themes) == 3 and themes[1] == themes[2]  # dark by preference is dark by choice
+    for theme in themes:
+        for ink in [
+            "ink",
+            "soft",
+            "link",
+            "adversary",
+            "ego",
+            "goal",
+            "heat",
+            "camera",
+            "tab",
+            "s",
+            "fp",
+            "mle",
+            "reference",
+        ]:
+            # WCAG AA: 4.5 for running text, 3 for graphics and large text.
+            need = 3.0 if ink in ("camera",) else 4.5
+            assert contrast(theme[ink], theme["card"]) >= need, ink
+
+
+def test_explanation_draws_the_field():
+    drawn = figures.explanation()
+    assert drawn["field"].count("<figure>") == len(figures.MOMENTS) == drawn["walk"].count("<figure>")
+    done = [int(n) for n in re.findall(r"(\d+) % done", drawn["field"])]
+    assert done == sorted(done) and done[-1] > 50
+    assert drawn["field"] != drawn["walk"]
