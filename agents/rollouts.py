@@ -40,9 +40,7 @@ class Rollouts:
     """Per episode the places of the counted visits, in order."""
 
 
-def run_bank(
-    policy: AdversaryPolicy, bank: Bank, tasks: NDArray[np.int64], rng: np.random.Generator
-) -> Rollouts:
+def run_bank(policy: AdversaryPolicy, bank: Bank, tasks: NDArray[np.int64], rng: np.random.Generator) -> Rollouts:
     """One episode of the policy on each of these tasks of the bank, side by side, until all have ended."""
     n = len(tasks)
     scenarios = [task.scenario for task in bank.tasks]

@@ -133,14 +133,15 @@ def style_figures(bank: Bank, rollouts: Rollouts, again: Rollouts | None = None)
     return figures
 
 
-def other_places(rollouts: Rollouts, reference: Rollouts) -> float:
+def other_places(bank: Bank, rollouts: Rollouts, reference: Rollouts) -> float:
     """Share of episodes whose visited places differ from the reference's on the same task, where they could differ."""
-    pairs = [
-        mine != theirs for mine, theirs, both in zip(
-            rollouts.places, reference.places, rollouts.completed & reference.completed, strict=True
-        ) if both
-    ]  # fmt: skip
-    return _mean([float(differ) for differ in pairs])
+    both = np.flatnonzero(rollouts.completed & reference.completed)
+    open_choice = [
+        i
+        for i in both
+        if len(bank.tasks[int(rollouts.task[i])].automaton.branch_places) > len(set(reference.places[i]))
+    ]
+    return _mean([float(rollouts.places[i] != reference.places[i]) for i in open_choice])
 
 
 def _path(rollouts: Rollouts, i: int) -> NDArray[np.float64]:
@@ -216,3 +217,25 @@ def run_held_out(policy: AdversaryPolicy, held_out: HeldOut, draw: int = 0) -> t
     bank = held_out.bank(policy, draw)
     rng = np.random.default_rng((held_out.seed, draw))
     return bank, run_bank(policy, bank, np.arange(len(bank)), rng)
+
+
+def measure_success(
+    policy: AdversaryPolicy,
+    per_mission: int,
+    seed: int = 99,
+    world: str = PHYSICS,
+    missions: Sequence[str] = ("M1", "M2", "M3", "M4", "M5"),
+    on_played: Callable[[int, int], None] | None = None,
+) -> list[MissionRecord]:
+    """Unopposed success on `per_mission` held-out tasks of each mission type, families in turn.
+
+    world: "physics" (pymunk) or "batched". Raises ValueError for another.
+    """
+    if world not in (BATCHED, PHYSICS):
+        raise ValueError(f"world is {world!r}, must be {BATCHED!r} or {PHYSICS!r}")
+    held_out = HeldOut.draw(per_mission * len(missions), seed, missions)
+    if world == BATCHED:
+        completed = run_held_out(policy, held_out)[1].completed
+    else:
+        completed = play_physics(policy, held_out.tasks, seed, on_played)
+    return mission_records(held_out.missions, completed, world)

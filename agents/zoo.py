@@ -23,7 +23,7 @@ from safetensors.numpy import save as save_tensors
 
 from tab_marl.agents.training_settings import TrainingSettings
 from tab_marl.envs.adversary_observation import LAYOUT_VERSION, OBSERVED
-from tab_marl.envs.styles import Style
+from tab_marl.envs.styles import STYLES, Style
 from tab_marl.mission.tasks import Task
 from tab_marl.world.scenario import UnknownName
 
@@ -235,3 +235,20 @@ def policy_of(
         sha256="0" * 64,
     )
     return ZooPolicy(card, weights, biases, state[LOG_STD].astype(np.float32))
+
+
+POLICY_FOLDER = "policy"
+
+
+def export_policy(model: Any, settings: TrainingSettings, out_dir: Path | str) -> Path:
+    """Write the actor of a trained model to ``out_dir/policy`` and return that folder. Raises OSError."""
+    usual = settings.style.name in STYLES and settings == TrainingSettings.for_style(
+        settings.style.name, name=settings.name, seed=settings.seed, steps=settings.steps
+    )
+    command = f"tab-marl train --style {settings.style.name} --name {settings.name} --seed {settings.seed} --steps {settings.steps}"
+    policy = policy_of(
+        model, settings, int(model.num_timesteps), command if usual else "tab-marl train --config settings.toml"
+    )
+    folder = Path(out_dir) / POLICY_FOLDER
+    save_policy(policy, folder)
+    return folder

@@ -154,7 +154,11 @@ def product_dijkstra(reached, crossed, symbol, table, progress, extra, cost):
 
 @njit(cache=True)
 def straight_cost(x, y, to_x, to_y, location, cell_at, cell_metres, symbol, table, cost):
-    """Cost in metres of the straight way between two points, inf when it crosses a blocked or impassable square."""
+    """Cost in metres of the straight way between two points at a location.
+
+    inf when it crosses a blocked or impassable square, or a square whose label changes the location before the end
+    (a place that the route goes around: the way may enter the last place, but not leave one).
+    """
     dx, dy = to_x - x, to_y - y
     far = math.hypot(dx, dy)
     if far < 1e-9:
@@ -166,7 +170,7 @@ def straight_cost(x, y, to_x, to_y, location, cell_at, cell_metres, symbol, tabl
             heading, best = m, along
     rows, columns = cell_at.shape
     steps = int(far / (0.5 * cell_metres)) + 1
-    total = 0.0
+    total, entered = 0.0, False
     for k in range(1, steps + 1):
         f = k / steps
         r, c = int((y + f * dy) / cell_metres), int((x + f * dx) / cell_metres)
@@ -175,6 +179,10 @@ def straight_cost(x, y, to_x, to_y, location, cell_at, cell_metres, symbol, tabl
         s = cell_at[r, c]
         if s < 0 or table[location, symbol[s]] == IMPASSABLE:
             return np.inf
+        changes = table[location, symbol[s]] != location
+        if entered and not changes:
+            return np.inf
+        entered = changes
         total += cost[s, heading]
     return total / steps * far
 
