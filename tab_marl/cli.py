@@ -41,7 +41,9 @@ def evaluate(
     missions: Annotated[str | None, typer.Option(help="Comma-separated, of M1 to M5.")] = None,
     families: Annotated[str | None, typer.Option(help="Comma-separated: point, perimeter, ambiguous.")] = None,
     planners: Annotated[str | None, typer.Option(help="Comma-separated planner names.")] = None,
-    adversaries: Annotated[str | None, typer.Option(help="Comma-separated zoo policies; default: all in turn.")] = None,
+    adversaries: Annotated[
+        str | None, typer.Option(help="Comma-separated: zoo policies, folders of policies, scripted.")
+    ] = None,
     episodes: Annotated[int | None, typer.Option(help="Episodes per mission, family and planner.")] = None,
     seed: Annotated[int | None, typer.Option(help="Base seed of tasks, adversaries and noise.")] = None,
     slack: Annotated[
@@ -81,8 +83,8 @@ def evaluate(
     from tab_marl.evaluation.store import Store
 
     notes = Console(stderr=True)
+    experiment = prepare(settings)
     with Store.create(out) as store:
-        experiment = prepare(settings)
         play_missing(experiment, store, play_job, notes, f"tab-marl {shlex.join(sys.argv[1:])}")
         from tab_marl.evaluation.present import present
 
@@ -136,7 +138,9 @@ def watch(
     family: Annotated[str, typer.Option(help="point, perimeter or ambiguous, on random maps.")] = "ambiguous",
     scenario: Annotated[str, typer.Option(help="random, or the name of a scenario.")] = "random",
     planner: Annotated[str, typer.Option(help="Who drives the ego.")] = "TAB-POMCP",
-    adversary: Annotated[str | None, typer.Option(help="Zoo policy; default: the first.")] = None,
+    adversary: Annotated[
+        str | None, typer.Option(help="A zoo policy, a folder, or scripted; default: the first of the zoo.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Decides map, starts and noise.")] = 0,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="A .gif, .mp4 or folder of PNGs instead of a window.")
@@ -176,7 +180,7 @@ app.add_typer(zoo_app, name="zoo")
 @zoo_app.command("list")
 def zoo_list() -> None:
     """Every policy with its style and success."""
-    from tab_marl.evaluation.single import zoo_table
+    from tab_marl.evaluation.zoo_view import zoo_table
 
     zoo_table()
 
@@ -184,7 +188,7 @@ def zoo_list() -> None:
 @zoo_app.command("show")
 def zoo_show(name: Annotated[str, typer.Argument(help="Name of a policy.")]) -> None:
     """The card of a policy."""
-    from tab_marl.evaluation.single import zoo_card
+    from tab_marl.evaluation.zoo_view import zoo_card
 
     print(zoo_card(name))
 
@@ -195,7 +199,7 @@ def zoo_verify(
     name: Annotated[str | None, typer.Argument(help="Name of a policy; default: all.")] = None,
 ) -> None:
     """Let policies complete held-out missions that nobody hinders; fails if one falls below what its card claims."""
-    from tab_marl.evaluation.single import verify_zoo
+    from tab_marl.evaluation.zoo_view import verify_zoo
 
     _announce_first_use()
     raise typer.Exit(0 if verify_zoo(name, episodes) else 1)
@@ -237,7 +241,7 @@ def user_message(error: Exception) -> str | None:
     import sqlite3
 
     if any(kind.__module__.startswith("tab_marl.") for kind in type(error).__mro__):
-        return " ".join(str(error).split())  # every exception that the package defines is written for its users
+        return one_line(str(error))  # every exception that the package defines is written for its users
     if hasattr(error, "format_message"):  # the command line parser's own errors
         return " ".join(str(error.format_message()).split())
     if isinstance(error, OSError):
@@ -248,6 +252,12 @@ def user_message(error: Exception) -> str | None:
     if isinstance(error, MemoryError):
         return "out of memory: use fewer --workers"
     return None
+
+
+def one_line(text: str) -> str:
+    """The text on one line, without carets that point at a line above."""
+    lines = [" ".join(line.split()) for line in text.splitlines() if line.strip(" ^")]
+    return "; ".join(lines).replace(":; ", ": ")
 
 
 def _fail(message: str, status: int) -> NoReturn:

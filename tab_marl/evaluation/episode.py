@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tab_marl.agents.adversaries import AdversaryPolicy
+from tab_marl.agents.adversaries import AdversaryPolicy, ScriptedAdversary
 from tab_marl.agents.planners import EgoAgent, PlannerOptions, make_planner
-from tab_marl.agents.zoo import load_zoo
+from tab_marl.agents.zoo import find_policy, load_policy, load_zoo
 from tab_marl.envs.intercept_v0 import parallel_env
-from tab_marl.evaluation.errors import Interrupted
+from tab_marl.evaluation.errors import Interrupted, UserError, require_known
 from tab_marl.evaluation.replay import Trace, shrink
 from tab_marl.evaluation.rows import EpisodeRow, Timing
 from tab_marl.evaluation.runner import stop_requested
@@ -169,7 +171,7 @@ def play_unit(job: Job, trace: bool = False) -> list[Played]:
             planner = make_planner(name, PlannerOptions(tab_field=FieldOptions.preset(job.planner_preset)))
             if job.learned is not None:
                 planner.restore(json.loads(job.learned))
-            policy = zoo()[job.adversary]
+            policy = opponent(job.adversary)
             _warm(name, task, policy)
             played.append(run_episode(task, planner, policy, episode_seed, trace, job.unit.seed, planner_seed))
         except (Interrupted, MemoryError):
@@ -196,7 +198,7 @@ def _broken(job: Job, planner: str, task: Task | None, error: Exception, seconds
         family=job.unit.family,
         planner=planner,
         seed=job.unit.seed,
-        adversary=job.adversary,
+        adversary=_name_in_row(job.adversary),
         slack=float("nan") if task is None else task.slack,
         intercepted=False,
         completed=False,
@@ -209,12 +211,42 @@ def _broken(job: Job, planner: str, task: Task | None, error: Exception, seconds
     return Played(row, Timing(0, float("nan"), float("nan"), seconds, traceback.format_exc()))
 
 
+def _name_in_row(adversary: str) -> str:
+    return adversary if os.sep not in adversary else Path(adversary).name
+
+
+SCRIPTED = "scripted"
+"""The route follower that nobody trained: may be asked for beside the zoo's policies."""
+
+
+@lru_cache(maxsize=64)
+def opponent(name: str) -> AdversaryPolicy:
+    """A shipped policy by name, `scripted`, or the policy in a folder. Raises UnknownName or PolicyError."""
+    return ScriptedAdversary() if name == SCRIPTED else find_policy(name)
+
+
 @lru_cache(maxsize=1)
-def zoo() -> dict[str, AdversaryPolicy]:
-    """The shipped policies by name."""
-    return {policy.name: policy for policy in load_zoo()}
-
-
 def zoo_names() -> tuple[str, ...]:
     """Names of the shipped policies, sorted."""
-    return tuple(sorted(zoo()))
+    return tuple(sorted(policy.name for policy in load_zoo()))
+
+
+def resolve_opponents(asked: Sequence[str]) -> dict[str, str]:
+    """What to call each opponent in a job -> digest of what it is; all shipped policies if none is asked for.
+
+    Shipped policies (whose files the code's fingerprint covers) go by name, others by the full path of their folder.
+    Raises UserError, UnknownName or PolicyError.
+    """
+    known = zoo_names()
+    if not asked:
+        if not known:
+            raise UserError("the zoo holds no adversary: train one with tab-marl train")
+        return dict.fromkeys(known, "")
+    found: dict[str, str] = {}
+    for name in asked:
+        if os.sep in name or (Path(name).is_dir() and name not in known):
+            policy = load_policy(name)
+            found[str(Path(name).resolve())] = policy.card.sha256[:16]
+        else:
+            found[require_known("adversary", (name,), (*known, SCRIPTED))[0]] = ""
+    return found

@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from tab_marl.evaluation.errors import Interrupted, UserError, require_known
+from tab_marl.evaluation.errors import Interrupted, UserError
 from tab_marl.evaluation.runner import Play, Result, run
 from tab_marl.evaluation.settings import EvaluationSettings, settings_key
 from tab_marl.evaluation.store import Store
@@ -37,14 +37,13 @@ class Experiment:
 
 def prepare(settings: EvaluationSettings) -> Experiment:
     """Resolve the adversaries and the code's fingerprint. Raises UserError for a policy that the zoo lacks."""
-    from tab_marl.evaluation.episode import zoo_names
+    from tab_marl.evaluation.episode import resolve_opponents
     from tab_marl.evaluation.settings import code_fingerprint
 
-    known = zoo_names()
-    if not known:
-        raise UserError("the zoo holds no adversary: train one with tab-marl train")
-    chosen = require_known("adversary", settings.adversaries, known) if settings.adversaries else known
-    return Experiment(settings, chosen, code_fingerprint())
+    found = resolve_opponents(settings.adversaries)
+    code = code_fingerprint()
+    digests = [digest for digest in found.values() if digest]
+    return Experiment(settings, tuple(found), "-".join([code, *digests]))
 
 
 def play_missing(experiment: Experiment, store: Store, play: Play, console: Console, hint: str) -> None:

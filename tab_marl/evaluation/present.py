@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,14 +11,17 @@ from typing import Any
 from rich.console import Console
 
 import tab_marl
+from tab_marl.agents.zoo import PolicyError
 from tab_marl.evaluation import console as text
 from tab_marl.evaluation import tables
+from tab_marl.evaluation.errors import UserError
 from tab_marl.evaluation.evaluate import REPORT_NAME
 from tab_marl.evaluation.replay import choose
 from tab_marl.evaluation.report import ReportData, write_report
 from tab_marl.evaluation.rows import EpisodeRow
 from tab_marl.evaluation.settings import FAMILIES, MISSIONS, PLANNERS
 from tab_marl.evaluation.store import Store, StoredSettings
+from tab_marl.world.scenario import UnknownName
 
 DEFAULT_REPLAYS = 3
 
@@ -32,16 +36,18 @@ def present(store: Store, stored: StoredSettings, folder: Path, replays: int | N
     planners = tables.order((r.planner for r in rows), PLANNERS)
     if choices:
         notes.print(f"playing {len(choices)} episodes again for the report", highlight=False)
-    from tab_marl.evaluation.episode import zoo
+    from tab_marl.evaluation.episode import opponent
     from tab_marl.evaluation.figures import explanation
     from tab_marl.evaluation.replaying import replay_groups
+    from tab_marl.evaluation.zoo_view import describe
 
     workers = stored.requested.get("workers") or os.cpu_count() or 1
     groups = replay_groups(choices, planners, stored.content, store, stored.key, workers)
-    known = zoo()
-    cards = [
-        {"name": name, "text": describe(known[name])} for name in sorted({r.adversary for r in rows}) if name in known
-    ]
+    cards = []
+    for name in stored.content["adversaries"]:
+        with contextlib.suppress(UserError, PolicyError, UnknownName):  # gone since: the rows still hold
+            policy = opponent(name)
+            cards.append({"name": policy.name, "text": describe(policy)})
     path = folder / REPORT_NAME
     wanted = {r.key for r in rows}
     timings = {key: timing for key, timing in store.timings(stored.key).items() if key in wanted}
@@ -66,9 +72,3 @@ def requested_rows(rows: list[EpisodeRow], requested: Mapping[str, Any]) -> list
         and r.planner in planners
         and (episodes is None or r.seed < episodes)
     ]
-
-
-def describe(policy: Any) -> str:
-    """A line about a policy, from its card."""
-    card = policy.card
-    return str(card.get("description", "")) if isinstance(card, Mapping) else str(getattr(card, "description", card))

@@ -45,36 +45,32 @@ class Choice:
 
 
 def choose(rows: Sequence[EpisodeRow], count: int) -> list[Choice]:
-    """Episodes by a rule that does not look for flattering ones.
+    """Episodes by rules that do not look for flattering ones, and that say what they look for.
 
-    In turn over the families: the episode whose outcomes are closest to its family's averages; then one in which
-    TAB-POMCP let the mission be completed although another planner of the paper's did not; then typical ones of other missions.
+    First a typical one (outcomes closest to the averages) of the family where prediction matters most; then the one in
+    which the paper's planners differ most; then one that TAB-POMCP lost and a rival won; then typical ones of the
+    other families and missions.
     """
     chosen: list[Choice] = []
-    taken: set[tuple[str, str, int]] = set()
 
-    def take(unit: tuple[str, str, int] | None, why: str) -> None:
-        if unit is not None and unit not in taken and len(chosen) < count:
-            taken.add(unit)
-            chosen.append(Choice(Unit(*unit), why))
+    def take(key: tuple[str, str, int] | None, why: str) -> None:
+        if key is not None and len(chosen) < count and all(choice.unit != Unit(*key) for choice in chosen):
+            chosen.append(Choice(Unit(*key), why))
 
-    families = [f for f in ("ambiguous", "point", "perimeter") if any(r.family == f for r in rows)]
-    families += [f for f in order((r.family for r in rows), FAMILIES) if f not in families]
-    used: set[str] = set()
-    for family in families:
-        missions = order((r.mission for r in rows if r.family == family), MISSIONS)
-        mission = next((m for m in missions if m not in used), missions[0])
-        used.add(mission)
+    present = {r.family for r in rows}
+    families = [f for f in ("ambiguous", *FAMILIES) if f in present]
+    families = list(dict.fromkeys(families + order(present, FAMILIES)))
+    missions = order((r.mission for r in rows), MISSIONS)
+    pairs = sorted(
+        ((f, m) for m in missions for f in families),
+        key=lambda pair: (missions.index(pair[1]), families.index(pair[0])),
+    )
+    for number, (family, mission) in enumerate(pairs):
         part = [r for r in rows if r.family == family and r.mission == mission]
         take(_typical(part), f"the most typical episode of {mission}, {family}: closest to the averages of the table")
-    for family in families:
-        take(_upset([r for r in rows if r.family == family]), f"{family}: one that TAB-POMCP lost and a rival won")
-    for mission in order((r.mission for r in rows), MISSIONS):
-        for family in families:
-            part = [r for r in rows if r.family == family and r.mission == mission]
-            take(
-                _typical(part), f"the most typical episode of {mission}, {family}: closest to the averages of the table"
-            )
+        if number == 0:
+            take(_widest(rows), "the episode of all in which the paper’s four planners differ most; not a typical one")
+            take(_upset(rows), "an episode that TAB-POMCP lost and a rival won")
     return chosen
 
 
@@ -96,6 +92,18 @@ def _typical(rows: Sequence[EpisodeRow]) -> tuple[str, str, int] | None:
     done = np.array([[scored_completed(u[p]) for p in planners] for u in units.values()], dtype=float)
     distance = ((steps - steps.mean(axis=0)) ** 2 + (done - done.mean(axis=0)) ** 2).sum(axis=1)
     return list(units)[int(np.argmin(distance))]
+
+
+def _widest(rows: Sequence[EpisodeRow]) -> tuple[str, str, int] | None:
+    units = _units(rows)
+    if not units:
+        return None
+
+    def spread(unit: dict[str, EpisodeRow]) -> float:
+        lost = [float(scored_completed(r)) for r in unit.values()]
+        return float(np.ptp(lost) + np.std(lost) + np.std([scored_steps(r) / r.horizon_steps for r in unit.values()]))
+
+    return max(sorted(units), key=lambda key: spread(units[key]))
 
 
 def _upset(rows: Sequence[EpisodeRow]) -> tuple[str, str, int] | None:

@@ -32,13 +32,14 @@ def _input() -> Iterator[None]:
 def solve_and_draw(mission: str, scenario: str, preset: str, out: Path) -> str:
     """Solve the field of a mission in English, draw it to `out`, and say what it says."""
     from tab_marl.field import FieldOptions, FieldProblem, solve
-    from tab_marl.mission import parse_mission, to_english
+    from tab_marl.mission import check_feasible, parse_mission, to_english
 
     _writable(out)
     with _input():
         world = Scenario.preset(scenario)
         parsed = parse_mission(mission, world)
         options = FieldOptions.preset(preset)
+        check_feasible(parsed, world)
         problem = FieldProblem.from_mission(parsed, world, options)
         field = solve(problem)
     done = field.completion_probability
@@ -70,15 +71,12 @@ def watch_episode(
     from tab_marl.agents.planners import PLANNERS, make_planner
     from tab_marl.envs.task_source import task_source
     from tab_marl.evaluation import film
-    from tab_marl.evaluation.episode import run_episode, zoo, zoo_names
+    from tab_marl.evaluation.episode import opponent, resolve_opponents, run_episode
     from tab_marl.evaluation.replaying import outcome
     from tab_marl.mission import to_english
 
     (planner,) = require_known("planner", (planner,), PLANNERS)
-    known = zoo_names()
-    if not known:
-        raise UserError("the zoo holds no adversary: train one with tab-marl train")
-    (name,) = require_known("adversary", (adversary,), known) if adversary else known[:1]
+    policy = opponent(next(iter(resolve_opponents((adversary,) if adversary else ()))))
     if out is None:
         if not (sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
             raise UserError("there is no display to open a window on; write a film with --out episode.gif")
@@ -97,11 +95,11 @@ def watch_episode(
             frames.append(env.render())
 
     played = run_episode(
-        task, agent, zoo()[name], seed, on_step=on_step, render_mode="human" if out is None else "rgb_array"
+        task, agent, policy, seed, on_step=on_step, render_mode="human" if out is None else "rgb_array"
     )
     lines = [
         f"mission    {to_english(task.mission, task.scenario)}",
-        f"played by  {planner} against {name}, seed {seed}",
+        f"played by  {planner} against {policy.name}, seed {seed}",
         f"outcome    {outcome(played.row)}",
     ]
     if out is not None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tab_marl.evaluation import replay
+from tab_marl.evaluation.units import Unit
 from tab_marl.world.scenario import Scenario
 
 
@@ -59,12 +60,18 @@ def test_choice_is_typical_not_flattering(synthetic):
     assert "typical" in first.why
 
 
-def test_a_defeat_is_shown_too(synthetic):
-    rows = rows_of(synthetic, {("M1", "ambiguous"): [(300, 900), (310, 910), (0, 500)], ("M2", "point"): [(100, 200)]})
-    chosen = replay.choose(rows, 3)
-    assert [c.unit.family for c in chosen] == ["ambiguous", "point", "ambiguous"]
-    assert chosen[2].unit.seed == 2 and "lost" in chosen[2].why
-    assert len({c.unit for c in replay.choose(rows, 30)}) == len(replay.choose(rows, 30))
+def test_widest_and_a_defeat_are_shown_and_named_so(synthetic):
+    rows = rows_of(
+        synthetic,
+        {("M1", "ambiguous"): [(300, 900), (310, 910), (320, 920)], ("M2", "point"): [(100, 200), (100, 0), (0, 5000)]},
+    )
+    chosen = replay.choose(rows, 4)
+    assert (chosen[0].unit.mission, chosen[0].unit.family) == ("M1", "ambiguous") and "typical" in chosen[0].why
+    assert chosen[1].unit == Unit("M2", "point", 1) and "differ most" in chosen[1].why
+    assert chosen[2].unit == Unit("M2", "point", 2) and "TAB-POMCP lost" in chosen[2].why
+    assert chosen[3].unit.family == "point" and "typical" in chosen[3].why
+    every = replay.choose(rows, 30)
+    assert len({c.unit for c in every}) == len(every)
 
 
 def test_nothing_to_choose_from(synthetic):

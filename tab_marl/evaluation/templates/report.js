@@ -166,8 +166,12 @@
         ctx.beginPath(); ctx.moveTo(x, y); ctx.lineTo(x + radius * Math.cos(turns[step] / 100), y + radius * Math.sin(turns[step] / 100));
         ctx.strokeStyle = hidden ? colour : palette.floor; ctx.stroke();
       }
+      const past = t.events.filter(([seconds]) => seconds <= time + 1e-6);
       let text = t.seen[step] === "1" ? "a camera sees the adversary" : "the adversary is out of sight", kind = "";
-      for (const [seconds, what] of t.events) if (seconds <= time + 1e-6 && what !== "seen") { text = what + " at " + seconds.toFixed(1) + " s"; kind = what === "intercepted" ? " met" : what === "mission completed" ? " lost" : ""; }
+      if (past.length) {
+        text = past.map(([seconds, what]) => `${what} at ${seconds.toFixed(1)} s`).join(", ");
+        kind = past[0][1] === "mission completed" ? " lost" : past.some(([, what]) => what === "intercepted") ? " met" : "";
+      }
       if (episode.note && exact >= end) text += ", " + episode.note;
       state.textContent = text;
       state.className = "state" + kind;
