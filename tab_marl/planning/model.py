@@ -26,14 +26,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
-from numba import cfunc, typeof, types
+from numba import typeof, types
 from numpy.typing import ArrayLike, NDArray
 
 from tab_marl.planning import table_kernels
+from tab_marl.planning.callbacks import callback
 
 _STATE = types.Array(types.float64, 1, "C")
 _COUNTS = types.Array(types.int64, 1, "C")
@@ -66,15 +67,15 @@ class CompiledModel:
     def functions(self) -> tuple[Any, Any, Any]:
         """step, rollout and prior compiled for this type of data (rollout and prior may be None)."""
         data = typeof(self.data)
-        step = _compiled(_plain(self.step), _STEP_RESULT(_STATE, types.int64, data, _RNG))
+        step = callback(_plain(self.step), _STEP_RESULT(_STATE, types.int64, data, _RNG))
         rollout = prior = None
         if self.rollout is not None:
-            rollout = _compiled(
+            rollout = callback(
                 _plain(self.rollout),
                 types.float64(_STATE, types.int64, types.int64, types.int64, types.int64, types.float64, data, _RNG),
             )
         if self.prior is not None:
-            prior = _compiled(
+            prior = callback(
                 _plain(self.prior),
                 types.void(_STATE, types.int64, types.int64, types.int64, data, _STATE, _COUNTS),
             )
@@ -106,31 +107,6 @@ def _plain(function: Callable[..., Any]) -> Callable[..., Any]:
     """The Python function behind a jitted one."""
     plain: Callable[..., Any] = getattr(function, "py_func", function)
     return plain
-
-
-class _Callback:
-    """A compiled function as an argument of the search.
-
-    A numba CFunc would do, but its type is worked out anew at each call, which takes as long as a hundred simulations.
-    """
-
-    def __init__(self, function: Any, signature: Any) -> None:
-        self._function = function  # keeps the machine code alive
-        self._address = int(function.address)
-        self._numba_type_ = types.FunctionType(signature)
-
-    def __wrapper_address__(self) -> int:
-        return self._address
-
-
-@lru_cache(maxsize=512)
-def _compiled(function: Callable[..., Any], signature: Any) -> _Callback:
-    try:
-        return _Callback(cfunc(signature, cache=True)(function), signature)
-    except RuntimeError as error:  # a function typed at a prompt has no file beside which to keep a cache
-        if "locator" not in str(error):
-            raise
-        return _Callback(cfunc(signature)(function), signature)
 
 
 @dataclass(frozen=True, eq=False)

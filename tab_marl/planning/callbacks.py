@@ -1,0 +1,57 @@
+"""Compiled functions as arguments of a compiled search that is cached on disk.
+
+A search that takes jitted functions as arguments is compiled anew in every process. numba's first-class function types avoid
+that: the search knows a signature and receives a pointer. numba's own way of handing over the pointer goes through a C wrapper
+(every argument copied twice) and works out the function's type at each call (as long as a hundred simulations take). The type
+below holds the address of the function proper and is made once; calls through it are those of any jitted function.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+from numba import njit, types
+from numba.core import cgutils
+from numba.experimental.function_type import FunctionModel
+from numba.extending import NativeValue, register_model, unbox
+
+
+class CallbackType(types.FunctionType):
+    """A first-class function type whose values are `Callback` objects."""
+
+
+register_model(CallbackType)(FunctionModel)
+
+
+@unbox(CallbackType)
+def _unbox_callback(typ: Any, obj: Any, c: Any) -> Any:
+    address = c.pyapi.object_getattr_string(obj, "address")
+    function = cgutils.create_struct_proxy(typ)(c.context, c.builder)
+    function.jit_addr = c.pyapi.long_as_voidptr(address)
+    c.pyapi.decref(address)
+    function.py_addr = c.builder.ptrtoint(obj, c.context.get_value_type(types.voidptr))
+    return NativeValue(function._getvalue())
+
+
+class Callback:
+    """A function compiled for one signature."""
+
+    def __init__(self, function: Callable[..., Any], signature: Any) -> None:
+        try:
+            compiled = njit(signature, cache=True)(function)
+        except RuntimeError as error:  # a function typed at a prompt has no file beside which to keep a cache
+            if "locator" not in str(error):
+                raise
+            compiled = njit(signature)(function)
+        result = compiled.get_compile_result(signature)
+        self._keep = compiled  # the machine code lives as long as this
+        self.address = int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
+        self._numba_type_ = CallbackType(signature)
+
+
+@lru_cache(maxsize=512)
+def callback(function: Callable[..., Any], signature: Any) -> Callback:
+    """The function compiled for the signature; remembered."""
+    return Callback(function, signature)
