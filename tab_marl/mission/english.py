@@ -96,7 +96,7 @@ def _goal(goal: Constraint, checkpoints: tuple[Place, ...], own_gap: bool, own_t
         parts.append(f"no faster than {plain_number(goal.speed_limit)} m/s")
     if goal.restricted:
         parts.append(f"without entering {_listed(goal.restricted, 'or')}")
-    comma = "," if goal.including and len(parts) > 1 else ""
+    comma = "," if " including " in parts[0] and len(parts) > 1 else ""
     return " ".join([parts[0] + comma, *parts[1:]])
 
 
@@ -104,7 +104,8 @@ def _time(goal: Constraint, seconds: float) -> str:
     exact = goal.type is ConstraintType.EXACT
     if goal.recurrences > 1:
         usual = goal.different if goal.different > 1 else DEFAULT_RECURRENCES
-        times = "" if goal.recurrences == usual else f" {_count(goal.recurrences)} times"
+        often = "twice" if goal.recurrences == 2 else f"{_count(goal.recurrences)} times"
+        times = "" if goal.recurrences == usual else f" {often}"
         return f"{'exactly ' if exact else ''}every {_seconds(seconds)}{times}"
     word = "present at exactly" if goal.presence else "in exactly" if exact else "within"
     return f"{word} {_seconds(seconds)}{' after the previous goal' if goal.since == 'previous' else ''}"
@@ -160,7 +161,7 @@ def _goal_reference(mission: Mission, index: int) -> str:
     first = next(i for i in mission.goal_indices if mission.constraints[i].places == goal.places)
     if len(goal.places) == 1 and first == index:
         return f"reaching {_the(goal.places[0])}"
-    return f"goal {mission.goal_indices.index(index) + 1}"
+    return f"goal {mission.goal_indices.index(index) + 1} is completed"
 
 
 def _listed(places: Sequence[Place | None], word: str) -> str:

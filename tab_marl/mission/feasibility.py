@@ -82,7 +82,9 @@ class _Search:
         self.mission, self.scenario, self.automaton, self.grid = mission, scenario, automaton, grid
         self.mask = automaton.masks(grid.centres)
         self.tick = automaton.tick_seconds
-        seconds: Floats = np.where(automaton.latest < UNBOUNDED, automaton.latest * self.tick, np.inf)
+        seconds = np.asarray(
+            np.where(automaton.latest < UNBOUNDED, automaton.latest * self.tick, np.inf), dtype=np.float64
+        )
         seconds[:, MISSION_CLOCK] = np.minimum(seconds[:, MISSION_CLOCK], scenario.horizon_seconds)
         self.latest = seconds
         self.earliest: Floats = automaton.earliest * self.tick

@@ -48,8 +48,7 @@ def advance(
 def _slot(keys, key):
     """Where `key` lies or belongs in an open-addressing table of a power-of-two size (-1: empty)."""
     size = keys.shape[0]
-    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
-    slot = np.int64(mixed >> np.uint64(32)) & (size - 1)
+    slot = ((key % 2147483647) * 40503 >> 8) & (size - 1)
     while keys[slot] != -1 and keys[slot] != key:
         slot = (slot + 1) & (size - 1)
     return slot

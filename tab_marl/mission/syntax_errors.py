@@ -46,6 +46,7 @@ PHRASES: dict[str, tuple[str, ...]] = {
     "FOR_FIRST": ("for the first",),
     "REACHING": ("reaching",),
     "GOAL": ("goal",),
+    "IS_DONE": ("is reached", "is completed"),
     "SECONDS": ("seconds", "s"),
     "METRES_PER_SECOND": ("m/s",),
     "AND": ("and",),
