@@ -86,10 +86,13 @@ class Arena:
             for robot, pose, kind in zip((scenario.ego, scenario.adversary), starts, _ROBOT_TYPES, strict=True)
         ]
         self._contacts = [0, 0]
+        self._pressed = False
+        """Whether the robots touch each other; impossible where they intercept from farther away."""
         for robot in (EGO, ADVERSARY):
             self._space.on_collision(
                 _ROBOT_TYPES[robot], _SOLID_TYPE, begin=self._on_begin, separate=self._on_separate, data=robot
             )
+        self._space.on_collision(*_ROBOT_TYPES, begin=self._on_meeting, separate=self._on_parting)
         self._step = self._space.step
 
     def _on_begin(self, arbiter: pymunk.Arbiter, space: Space, robot: Any) -> None:
@@ -99,10 +102,16 @@ class Arena:
     def _on_separate(self, arbiter: pymunk.Arbiter, space: Space, robot: Any) -> None:
         self._contacts[robot] -= 1
 
+    def _on_meeting(self, arbiter: pymunk.Arbiter, space: Space, data: object) -> None:
+        self._pressed = True
+
+    def _on_parting(self, arbiter: pymunk.Arbiter, space: Space, data: object) -> None:
+        self._pressed = False
+
     def command(self, ego: tuple[float, float], adversary: tuple[float, float]) -> None:
         """Command (speed [m/s], turn rate [rad/s]) of both robots; call before a run of substeps."""
-        self._drives[EGO].command(*ego, self.touching[EGO])
-        self._drives[ADVERSARY].command(*adversary, self.touching[ADVERSARY])
+        self._drives[EGO].command(*ego, self._pressed or self.touching[EGO])
+        self._drives[ADVERSARY].command(*adversary, self._pressed or self.touching[ADVERSARY])
         self.touching[EGO] = self._contacts[EGO] > 0
         self.touching[ADVERSARY] = self._contacts[ADVERSARY] > 0
 

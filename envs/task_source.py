@@ -8,12 +8,16 @@ import numpy as np
 
 from tab_marl.envs.paper_missions import paper_mission
 from tab_marl.mission import Mission, parse_mission
+from tab_marl.mission.feasibility import check_feasible
 from tab_marl.mission.library import MISSIONS
 from tab_marl.mission.tasks import FAMILIES, MISSION_IDS, Task, sample_task
 from tab_marl.world.scenario import Scenario, UnknownName
 
 TaskSource = Callable[[np.random.Generator], Task]
 """Draws the task of an episode."""
+
+UNKNOWN_SLACK = 0.0
+"""Slack of a task whose mission was given, not fitted."""
 
 RANDOM = "random"
 """As a scenario: a random map, mission and starts at every reset."""
@@ -47,14 +51,19 @@ def task_source(
 
 
 def fixed_task(mission: str | Mission, scenario: str | Scenario) -> Task:
-    """A mission on a scenario, each by name or as it is."""
+    """A mission on a scenario, each by name or as it is. Raises InfeasibleMission if it cannot be completed there."""
     world = Scenario.preset(scenario) if isinstance(scenario, str) else scenario
     if not isinstance(world, Scenario):
         raise TypeError(f"scenario is {scenario!r}, must be a Scenario, a preset's name or 'random'")
     if isinstance(mission, Mission):
-        return Task(world, mission, mission.name, "custom", float("nan"))
+        return _custom(world, mission)
     if not isinstance(mission, str):
         raise TypeError(f"mission is {mission!r}, must be a Mission, an English text, or one of {list(MISSIONS)}")
     if mission in MISSIONS:
         return paper_mission(mission, world)
-    return Task(world, parse_mission(mission, world), "", "custom", float("nan"))
+    return _custom(world, parse_mission(mission, world))
+
+
+def _custom(scenario: Scenario, mission: Mission) -> Task:
+    check_feasible(mission, scenario)
+    return Task(scenario, mission, mission.name, "custom", UNKNOWN_SLACK)

@@ -1,0 +1,123 @@
+"""Steps per second of the interception environment beside a bare pymunk loop, in one run on one core.
+
+The bare loop has the same walls and obstacles and two bodies that drive the same circles, their velocities assigned once
+per environment step, and does nothing else but ten `Space.step`s: what pymunk leaves to any environment at this rate.
+
+Run: python benchmarks/env_speed.py
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pymunk
+
+from tab_marl.envs.intercept import InterceptEnv
+from tab_marl.envs.single_agent import ego_env
+from tab_marl.world.regions import Disc
+from tab_marl.world.scenario import Scenario
+
+STEPS = 500
+"""Per repetition, and less than an episode."""
+REPEATS = 9
+STARTS = ((2.0, 2.6, 0.0), (1.5, 0.4, 0.0))
+CIRCLE = (0.0, 1.0)
+"""Half the top speed at the top turn rate: circles of 6 cm radius, in free space."""
+
+Step = Callable[[int], object]
+
+
+def rates(make: dict[str, Callable[[], Step]]) -> dict[str, float]:
+    """Median steps per CPU second, the candidates taking turns."""
+    found: dict[str, list[float]] = {name: [] for name in make}
+    for _ in range(REPEATS):
+        for name, begin in make.items():
+            step = begin()
+            began = time.process_time()
+            for i in range(STEPS):
+                step(i)
+            found[name].append(STEPS / (time.process_time() - began))
+    return {name: statistics.median(values) for name, values in found.items()}
+
+
+def bare_pymunk(scenario: Scenario) -> Step:
+    space = pymunk.Space()
+    w, h = scenario.width_metres, scenario.height_metres
+    boxes = [(-0.5, -0.5, 0.0, h), (w, 0.0, w + 0.5, h), (0.0, -0.5, w, 0.0), (0.0, h, w, h + 0.5)]
+    outlines = [[(a, b), (c, b), (c, d), (a, d)] for a, b, c, d in boxes]
+    outlines += [o.vertices().tolist() for o in scenario.obstacles if not isinstance(o, Disc)]
+    space.add(*(pymunk.Poly(space.static_body, outline) for outline in outlines))
+    bodies = []
+    for x, y, _ in STARTS:
+        body = pymunk.Body(1.0, pymunk.moment_for_circle(1.0, 0.0, 0.105))
+        body.position = (x, y)
+        space.add(body, pymunk.Circle(body, 0.105))
+        bodies.append(body)
+
+    def step(i: int) -> None:
+        theta = 0.182 * i
+        for body in bodies:
+            body.velocity = (0.11 * math.cos(theta), 0.11 * math.sin(theta))
+            body.angular_velocity = 1.82
+        for _ in range(10):
+            space.step(0.01)
+
+    return step
+
+
+def parallel(scenario: Scenario, actions: np.ndarray, mission: str = "M1") -> Step:
+    """Both agents act; `actions` ``[STEPS, 2, 2]``."""
+    env = InterceptEnv(mission=mission, scenario=scenario)
+    options = {"ego_start": STARTS[0], "adversary_start": STARTS[1]}
+    env.reset(seed=0, options=options)
+    given = [{"ego_0": ego, "adversary_0": adversary} for ego, adversary in actions.astype(np.float32)]
+
+    def step(i: int) -> None:
+        env.step(given[i])
+        if not env.agents:
+            env.reset(options=options)
+
+    return step
+
+
+def single_agent(scenario: Scenario) -> Step:
+    env = ego_env(scenario=scenario, end_on_completion=False)
+    env.reset(seed=0)
+    action = np.array(CIRCLE, dtype=np.float32)
+
+    def step(i: int) -> None:
+        _, _, terminated, truncated, _ = env.step(action)
+        if terminated or truncated:
+            env.reset()
+
+    return step
+
+
+def main() -> None:
+    lidar = Scenario.preset("lab")
+    plain = replace(lidar, sensors=replace(lidar.sensors, lidar_rays=0))
+    circles = np.tile(np.array(CIRCLE), (STEPS, 2, 1))
+    random = np.random.default_rng(0).uniform(-1, 1, (STEPS, 2, 2))
+    found = rates(
+        {
+            "bare pymunk loop": lambda: bare_pymunk(plain),
+            "parallel env": lambda: parallel(plain, circles),
+            "parallel env, mission M5": lambda: parallel(plain, circles, "M5"),
+            "parallel env, random actions": lambda: parallel(plain, random),
+            "parallel env, 12 lidar rays": lambda: parallel(lidar, circles),
+            "Gymnasium view, scripted adversary": lambda: single_agent(plain),
+        }
+    )
+    base = found["bare pymunk loop"]
+    print(f"{'':36}{'steps/s':>10}{'of bare':>10}")
+    for name, steps in found.items():
+        print(f"{name:36}{steps:10,.0f}{steps / base:10.2f}")
+
+
+if __name__ == "__main__":
+    main()
