@@ -55,9 +55,9 @@ class ProductChain(NamedTuple):
     factor: NDArray[np.float64]
     """``[Q, L]`` ``w(q, l) exp(log_scale[q'] - log_scale[q])``."""
     value: Table
-    """``[Q, S]`` h / exp(log_scale[q])."""
+    """``[Q, S]`` h / exp(log_scale[q]), up to one factor common to all rows."""
     norm: Table
-    """``[Q, S]`` the kernel's normaliser / exp(log_scale[q]); the same array as `value` where h is harmonic."""
+    """``[Q, S]`` the kernel's normaliser on the same scale; the same array as `value` where h is harmonic."""
     log_scale: NDArray[np.float64]
     """``[Q]``."""
     initial: int

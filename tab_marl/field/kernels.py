@@ -7,7 +7,7 @@ states, L label symbols, R references. One tick of reference r: the mode is redr
 moves by CSR row ``r * S + cell * M + m'``; rows may sum to less than 1 (the rest of the mass is killed).
 `motion` is a `reference.Motion`: the moves, and `mix` once more as what lies near a mode plus a jump to any mode,
 ``mix[r, m] = near(m) + jump[r, m] * redraw[r]``; rows of constant `width` 4 take an unrolled path.
-A table ``value[q, s]`` holds h / exp(log_scale[q]).
+A table ``value[q, s]`` holds h / exp(log_scale[q]), up to one factor common to all rows (their peak).
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def backward(order, motion, reference_of, labels, delta, weight, peak, value, lo
         factor = peak / largest
         for s in range(states):
             value[q, s] = row[s] * factor
-        log_scale[q] = base + math.log(largest) - math.log(peak)
+        log_scale[q] = base + math.log(largest / peak)
 
 
 @njit(cache=True)

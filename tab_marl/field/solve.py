@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,8 +15,9 @@ from tab_marl.field.tab_field import TabField, expected_transitions, start_log_p
 
 Floats = NDArray[np.float64]
 
-# Rows of single-precision messages are scaled to this maximum, which leaves 66 decades below it.
-PEAK_SINGLE = 1e30
+# Rows of messages are scaled to these maxima, to use the whole range of the number format: 68 and 600 decades below.
+# Powers of 2, so that scaling rounds nothing.
+PEAK = {"single": 2.0**100, "double": 2.0**930}
 
 
 class InfeasibleField(ValueError):
@@ -26,6 +29,16 @@ def solve(problem: FieldProblem) -> TabField:
 
     Exact on the product of cells and mission automaton (design, section 4). Raises InfeasibleField.
     """
+    try:
+        return _solve(problem)
+    except InfeasibleField:
+        if problem.options.precision == "double":
+            raise
+        # A start more than 68 decades less likely to complete than the best state: single precision cannot hold it.
+        return _solve(replace(problem, options=replace(problem.options, precision="double")))
+
+
+def _solve(problem: FieldProblem) -> TabField:
     tilt = Tilt.of(problem)
     flux: Floats | None = None
     error, rounds = 0.0, 1
@@ -49,16 +62,17 @@ def message(problem: FieldProblem, tilt: Tilt) -> ProductChain:
     count, states = len(automaton.delta), motion.states
     single = problem.options.precision == "single"
     value = np.empty((count, states), dtype=np.float32 if single else np.float64)
+    peak = PEAK[problem.options.precision]
     log_scale = np.zeros(count)
-    value[automaton.accepting] = 1.0
-    value[automaton.rejecting] = 1.0 if np.isfinite(tilt.log_failure) else 0.0
+    value[automaton.accepting] = peak
+    value[automaton.rejecting] = peak if np.isfinite(tilt.log_failure) else 0.0
     log_scale[automaton.rejecting] = tilt.log_failure
     weight = np.exp(tilt.log_weight())
     transient = np.setdiff1d(np.arange(count), [automaton.accepting, automaton.rejecting, automaton.initial])
     order = transient[np.argsort(-automaton.rank[transient], kind="stable")].astype(np.int32)
     kernels.backward(
         order, motion.motion, problem.reference_of, problem.labels, automaton.delta, weight,
-        PEAK_SINGLE if single else 1.0, value, log_scale,
+        peak, value, log_scale,
     )  # fmt: skip
     # The initial state only reads the first label and is never left by a move; its scale is that of what follows.
     value[automaton.initial] = 0.0
@@ -74,7 +88,7 @@ def message(problem: FieldProblem, tilt: Tilt) -> ProductChain:
     if not feasible.any():
         raise InfeasibleField(
             "no trajectory of the reference process completes the mission from any start cell: "
-            "the bounds are too tight, or the goal cannot be reached"
+            "the bounds are too tight, the goal cannot be reached, or its probability is below 1e-600"
         )
     start = np.where(feasible, chain.start, 0.0)
     return chain._replace(start=start / start.sum())

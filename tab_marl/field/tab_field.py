@@ -49,7 +49,7 @@ class TabField:
     @property
     def backward(self) -> tuple[Table, Floats]:
         """(value ``[Q, S]``, log_scale ``[Q]``): h = value * exp(log_scale)."""
-        return self.bridge.value, self.bridge.log_scale
+        return self.bridge.value, self.bridge.log_scale - np.log(float(self.bridge.value[self.bridge.accepting, 0]))
 
     @cached_property
     def log_partition(self) -> float:
@@ -145,11 +145,12 @@ def start_log_partition(chain: ProductChain) -> Floats:
     out = np.full(chain.cells, -np.inf)
     first = chain.delta[chain.initial, chain.labels]
     table = chain.value.reshape(len(chain.value), chain.cells, chain.modes)
+    peak = float(chain.value[chain.accepting, 0])
     for cell in np.flatnonzero(chain.start > 0):
         total = float(table[first[cell], cell].astype(np.float64) @ chain.mode_shares)
         factor = chain.factor[chain.initial, chain.labels[cell]]
-        if total * factor > 0:
-            out[cell] = np.log(total) + np.log(factor) + chain.log_scale[chain.initial]
+        if total > 0 and factor > 0:
+            out[cell] = np.log(total) - np.log(peak) + np.log(factor) + chain.log_scale[chain.initial]
     return out
 
 

@@ -56,7 +56,8 @@ ALONE = [(n, r) for n in MISSIONS for r in REFERENCES if (n, r) != ("slow stage"
 def test_mission_alone(name, reference, oracle, tiny_scenario):
     enumerate_trajectories, mission_runner = oracle
     speed = 0.7 if reference == "run_and_tumble" and name in ("deadline", "exact") else 1.0
-    scenario = tiny_scenario(speed)
+    start = Box(0, 0, 1, 1) if reference == "run_and_tumble" else Box(0, 0, 2, 1)
+    scenario = tiny_scenario(speed, adversary_start=start)
     problem = problem_of(MISSIONS[name], scenario, reference)
     every = enumerate_trajectories(problem, HORIZON, mission_runner(MISSIONS[name], scenario, problem.grid))
     completing = every.completed_tick >= 0
