@@ -58,10 +58,9 @@ class _CompiledAsPython:
     def __init__(self, model: CompiledModel, options: PomcpOptions, belief: Any, rng: np.random.Generator) -> None:
         self.model = model
         self.states, self.weights = belief_states(model, belief, options.simulations, rng)
-        self.stream = _Stream(int(rng.integers(2**64, dtype=np.uint64)))
-        self.word = rng.integers(2**64, size=1, dtype=np.uint64)
         shared = len(self.states) if options.common_random_numbers else 0
-        self.seeds = rng.integers(2**64, size=shared, dtype=np.uint64)
+        words = rng.integers(2**64, size=2 + shared, dtype=np.uint64)
+        self.stream, self.word, self.seeds = _Stream(int(words[0])), words[1:2], words[2:]
         self.has_rollout, self.has_prior = model.rollout is not None, model.prior is not None
 
     def start(self, particle: int) -> NDArray[np.float64]:

@@ -184,14 +184,13 @@ class Pomcp:
         seconds = time.perf_counter() - started
         values = np.full(actions, -np.inf)
         visits = np.zeros(actions, dtype=np.int64)
-        at_root = np.arange(len(root[0]))
-        visits[root[0]] = tree.edges["visits"][at_root]
-        values[root[0]] = np.where(visits[root[0]] > 0, tree.edges["value"][at_root], -np.inf)
-        if np.isnan(values).any() or np.isposinf(values).any() or (np.isneginf(values) & (visits > 0)).any():
-            action = int(np.flatnonzero((visits > 0) & ~np.isfinite(values))[0])
-            raise ValueError(
-                f"action {action} has value {values[action]}: the model's rewards or rollouts are not all finite"
-            )
+        at_root = tree.edges[: len(root[0])]
+        visits[root[0]] = at_root["visits"]
+        values[root[0]] = np.where(at_root["visits"] > 0, at_root["value"], -np.inf)
+        broken = (visits > 0) & ~np.isfinite(values)
+        if broken.any():
+            action = int(np.argmax(broken))
+            raise ValueError(f"action {action} has value {values[action]}: the model's rewards or rollouts are not all finite")
         keys = (values, visits) if self.options.choose == "value" else (visits, values)
         best = np.flatnonzero(keys[0] == keys[0].max())
         action = int(best[np.argmax(keys[1][best])])
@@ -253,10 +252,9 @@ def _grow_compiled(
     states, weights = belief_states(model, belief, options.simulations, rng)
     step, rollout, prior = model.functions
     actions, horizon = model.actions, options.horizon
-    tree_stream = rng.integers(2**64, size=1, dtype=np.uint64)
-    model_stream = rng.integers(2**64, size=1, dtype=np.uint64)
     shared = len(states) if options.common_random_numbers else 0
-    seeds = rng.integers(2**64, size=shared, dtype=np.uint64)
+    words = rng.integers(2**64, size=2 + shared, dtype=np.uint64)
+    tree_stream, model_stream, seeds = words[:1], words[1:2], words[2:]
 
     most = min(options.max_nodes, options.simulations + 1)
     size = min(most, _FIRST_NODES)
