@@ -8,8 +8,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from tab_marl.envs import adversary_kernels as kernels
-from tab_marl.envs.adversary_observation import OBSERVED, AdversaryTask
+from tab_marl.envs.adversary_observation import AdversaryObserver, AdversaryTask, observation_bounds
 from tab_marl.envs.lidar import Lidar
 from tab_marl.envs.physics import Motion
 from tab_marl.envs.styles import Style
@@ -17,13 +16,11 @@ from tab_marl.mission.monitor import Monitor
 from tab_marl.mission.tasks import Task
 from tab_marl.world.scenario import Scenario
 
-OBSERVATION_BOUND = 2.5
-"""Every row of the adversary's observation lies within +- this."""
-
 
 def adversary_space() -> Box:
     """The Box of the adversary's observation (layout: `adversary_observation`), float32."""
-    return Box(-OBSERVATION_BOUND, OBSERVATION_BOUND, (OBSERVED,), dtype=np.float32)
+    low, high = observation_bounds()
+    return Box(low, high, dtype=np.float32)
 
 
 def as_style(style: Style | str | None) -> Style:
@@ -53,17 +50,9 @@ class AdversarySide:
         self.monitor = Monitor(
             task.mission, task.scenario, 1.0 / task.scenario.control_hertz, automaton=self.task.automaton
         )
-        self._memory = np.zeros(2, dtype=np.int32)
-        self._clocks = np.zeros(3, dtype=np.int32)
-        self._out = np.zeros(OBSERVED, dtype=np.float32)
+        self._observer = AdversaryObserver(self.task)
 
     def observe(self, own: Motion, ego: Motion | None) -> NDArray[np.float32]:
         """``[OBSERVED]``; `ego` is None while it is not noticed. Zeros once the mission is over."""
-        x, y, theta, v, w = own
-        ego_x, ego_y = (0.0, 0.0) if ego is None else (ego.x, ego.y)
-        self._clocks[:] = self.monitor.clocks
-        kernels.observe(
-            self.task.tables, 0, x, y, theta, v, w, self.monitor.location, self._clocks, self._memory,
-            ego is not None, ego_x, ego_y, self._out,
-        )  # fmt: skip
-        return self._out.copy()
+        noticed = None if ego is None else (ego.x, ego.y)
+        return self._observer.observe(*own, self.monitor.location, self.monitor.clocks, noticed)
