@@ -68,6 +68,12 @@ class Canvas:
         px, py = self.at(x, y)
         return (px / SUPERSAMPLING, py / SUPERSAMPLING)
 
+    def inside(self) -> pygame.Rect:
+        """The arena's pixels, without the margin."""
+        left, top = self.at(0.0, self.height_metres)
+        right, bottom = self.at(self.width_metres, 0.0)
+        return pygame.Rect(round(left), round(top), round(right - left), round(bottom - top))
+
     def layer(self) -> Canvas:
         """An empty transparent canvas of the same geometry."""
         return Canvas(

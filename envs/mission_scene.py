@@ -49,13 +49,13 @@ def _region(place: Place, scenario: Scenario) -> Region:
 
 
 def _stage_text(goal: Constraint) -> str:
-    names = [p if isinstance(p, str) else f"target {place_name(p)}" for p in goal.places]
+    names = [place_name(p) for p in goal.places]
     if goal.different > 1:
         text = f"{goal.different} of {_listed(names)}"
     elif len(names) > 1:
         text = f"any of {_listed(names)}"
     else:
-        text = names[0]
+        text = _listed(names)
     if goal.recurrences > 1:
         every = "every" if goal.type is ConstraintType.DEADLINE else "exactly every"
         return f"{text}, {every} {goal.seconds:g} s, {goal.recurrences} times" if goal.seconds else text
@@ -63,13 +63,20 @@ def _stage_text(goal: Constraint) -> str:
         within = "at exactly" if goal.type is ConstraintType.EXACT else "within"
         text += f", {within} {goal.seconds:g} s"
     if goal.max_gap_seconds is not None:
-        text += f", at most {goal.max_gap_seconds:g} s apart"
+        text += f", at most {goal.max_gap_seconds:g} s {'apart' if goal.visits > 1 else 'after the last'}"
     return text
 
 
 def _listed(names: list[str]) -> str:
-    """A, B, C for checkpoints, which share their first word; the names themselves otherwise."""
-    short = [name.removeprefix("Checkpoint ") for name in names]
-    if all(name.startswith("Checkpoint ") for name in names):
-        return "checkpoints " + ", ".join(short)
+    """Checkpoints and bare points share their first word; other names stand by themselves."""
+    for kind, prefix in (("checkpoint", "Checkpoint "), ("target", "[")):
+        if all(name.startswith(prefix) for name in names):
+            shown = [name.removeprefix("Checkpoint ") for name in names]
+            return (
+                names[0] if kind == "checkpoint" and len(names) == 1 else f"{_plural(kind, names)} {', '.join(shown)}"
+            )
     return ", ".join(names)
+
+
+def _plural(word: str, names: list[str]) -> str:
+    return word + "s" if len(names) > 1 else word

@@ -24,6 +24,8 @@ MAP_PIXELS = 672
 """The longer side of the arena on the final picture."""
 MARGIN_PIXELS = 24
 PANEL_PIXELS = 320
+NAME_LOWEST_SHARE = 0.035
+"""Names stay at least this share of the arena's height above its lower wall."""
 NAME_PIXELS = 3
 """Between a place and its name below."""
 TRAIL_SECONDS = 12.0
@@ -72,10 +74,7 @@ class Renderer:
         self.scene = scene
         longest = max(scenario.width_metres, scenario.height_metres)
         self._canvas = d.Canvas(scenario.width_metres, scenario.height_metres, MAP_PIXELS / longest, MARGIN_PIXELS)
-        known = [region for _, region in scenario.named_regions()]
-        places = [] if scene is None else [region for stage in scene.stages for region in stage.regions]
-        self._unnamed = tuple(dict.fromkeys(place for place in places if place not in known))
-        """Bare target points of the mission."""
+        self._places = _named_places(scenario, scene)
         self._base = self._draw_map()
         map_width, map_height = (side // d.SUPERSAMPLING for side in self._base.get_size())
         self.size = (map_width + PANEL_PIXELS, max(map_height, MAP_PIXELS + 2 * MARGIN_PIXELS))
@@ -102,7 +101,9 @@ class Renderer:
         scaled = canvas.picture()
         picture.blit(scaled, (0, self._map_top))
         if frame.intercepted:
-            self._write_banner(picture, f"Intercepted at {frame.seconds:.1f} s", d.EGO)
+            late = frame.completed_seconds is not None
+            text = f"Intercepted at {frame.seconds:.1f} s" + (", after the mission" if late else "")
+            self._write_banner(picture, text, d.ADVERSARY if late else d.EGO)
         elif frame.over and frame.completed_seconds is not None:
             self._write_banner(picture, f"Mission completed at {frame.completed_seconds:.1f} s", d.ADVERSARY)
         elif frame.over:
@@ -141,6 +142,7 @@ class Renderer:
     def _draw_places(self, frame: Frame) -> None:
         canvas, scenario = self._canvas, self.scenario
         goals, avoided = self._goals(frame), () if self.scene is None else self.scene.avoided
+        canvas.surface.set_clip(canvas.inside())
         zone = scenario.region("central zone")
         if zone not in avoided:
             x, y = zone.centre
@@ -155,14 +157,12 @@ class Renderer:
             else:
                 canvas.disc(*at, d.CAMERA, 20)
                 canvas.dashes(*at, d.CAMERA, 1.25, 190)
-        for checkpoint in scenario.checkpoints:
-            if checkpoint.region not in goals:
-                canvas.region(checkpoint.region, d.MUTED, 26, 1.5, 160)
-        for place in self._unnamed:
+        for _, place in self._places:
             if place not in goals:
                 canvas.region(place, d.MUTED, 26, 1.5, 160)
         for goal in goals:
             canvas.region(goal, d.GOAL, 46, 2.5)
+        canvas.surface.set_clip(None)
 
     def _goals(self, frame: Frame) -> tuple[Region, ...]:
         """Regions of the stage that is current."""
@@ -211,11 +211,9 @@ class Renderer:
 
     def _write_names(self, frame: Frame) -> None:
         canvas, goals = self._canvas, self._goals(frame)
-        named = [(c.name, c.region) for c in self.scenario.checkpoints] + list(self.scenario.regions)
-        named += [("target", place) for place in self._unnamed]
-        for name, region in named:
+        for name, region in self._places:
             bold = region in goals
-            px, py = canvas.at(region.centre[0], region.bounds()[1])
+            px, py = canvas.at(region.centre[0], max(region.bounds()[1], NAME_LOWEST_SHARE * canvas.height_metres))
             d.write(
                 canvas.surface, name, (px, py + NAME_PIXELS * d.SUPERSAMPLING), 12 * d.SUPERSAMPLING,
                 d.GOAL if bold else d.INK, bold, "midtop", halo=d.FLOOR,
@@ -223,12 +221,22 @@ class Renderer:
 
     def _write_banner(self, picture: pygame.Surface, text: str, colour: d.Colour) -> None:
         middle = (self.size[0] - PANEL_PIXELS) // 2
-        box = pygame.Rect(0, 0, 12 * len(text) + 40, 40)
+        box = pygame.Rect(0, 0, 10 * len(text) + 60, 40)
         box.midtop = (middle, self._map_top + MARGIN_PIXELS + 14)
         shape = pygame.Surface((box.width * 2, box.height * 2), pygame.SRCALPHA)
         pygame.draw.rect(shape, (*colour, 240), shape.get_rect(), border_radius=box.height)
         picture.blit(pygame.transform.smoothscale(shape, box.size), box)
         d.write(picture, text, box.center, 17, (255, 255, 255), True, "center")
+
+
+def _named_places(scenario: Scenario, scene: MissionScene | None) -> tuple[tuple[str, Region], ...]:
+    """What is outlined and named: checkpoints, the scenario's own regions, and other goals of the mission."""
+    names = {region: name for name, region in reversed(scenario.named_regions())}
+    places = [(c.name, c.region) for c in scenario.checkpoints] + list(scenario.regions)
+    shown = {region for _, region in places}
+    goals = [] if scene is None else [region for stage in scene.stages for region in stage.regions]
+    places += [(names.get(goal, "target"), goal) for goal in dict.fromkeys(goals) if goal not in shown]
+    return tuple(places)
 
 
 def _draw_robot(canvas: d.Canvas, motion: Motion, radius: float, colour: d.Colour, seen: bool) -> None:
