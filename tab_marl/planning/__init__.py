@@ -5,11 +5,13 @@
 
 from __future__ import annotations
 
+from tab_marl.planning.belief import BeliefDepleted, update_particles
 from tab_marl.planning.model import CompiledModel, Particles, PythonModel, table_model
 from tab_marl.planning.pomcp import Plan, Pomcp, PomcpOptions
 from tab_marl.planning.tree import SearchTree
 
 __all__ = [
+    "BeliefDepleted",
     "CompiledModel",
     "Particles",
     "Plan",
@@ -18,4 +20,5 @@ __all__ = [
     "PythonModel",
     "SearchTree",
     "table_model",
+    "update_particles",
 ]

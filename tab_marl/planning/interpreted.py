@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.planning.kernels import NO_CHILD, NO_SIBLING, UNEXPANDED
+from tab_marl.planning.kernels import NO_CHILD, UNEXPANDED
 from tab_marl.planning.model import CompiledModel, Particles, belief_states, check_weights, draw_particles
 from tab_marl.planning.tree import EDGE, NODE, ROOT, SearchTree
 
 if TYPE_CHECKING:
-    from tab_marl.planning.pomcp import PomcpOptions, Root
+    from tab_marl.planning.pomcp import PomcpOptions
 
 _MASK = 2**64 - 1
 _GOLDEN = 0x9E3779B97F4A7C15
@@ -130,13 +130,13 @@ class _PythonModel:
 class _Growing:
     """The tree as lists, while it grows."""
 
-    def __init__(self, root: Root) -> None:
-        chosen, values, counts = (part.tolist() for part in root)
-        self.seen: list[Hashable] = [0]
-        self.sibling, self.node_visits = [NO_SIBLING], [sum(counts)]
-        self.first_edge, self.edge_count = [0], [len(chosen)]
-        self.actions, self.values, self.edge_visits = chosen, values, counts
-        self.child = [NO_CHILD] * len(chosen)
+    def __init__(self, start: SearchTree) -> None:
+        nodes, edges = start.nodes, start.edges
+        self.seen: list[Any] = [start.observation(n) if n else 0 for n in range(len(start))]
+        self.sibling, self.node_visits = nodes["sibling"].tolist(), nodes["visits"].tolist()
+        self.first_edge, self.edge_count = nodes["first_edge"].tolist(), nodes["edge_count"].tolist()
+        self.actions, self.values = start.edge_actions.tolist(), edges["value"].tolist()
+        self.edge_visits, self.child = edges["visits"].tolist(), edges["child"].tolist()
 
     def edges_of(self, node: int) -> range:
         return range(self.first_edge[node], self.first_edge[node] + self.edge_count[node])
@@ -189,14 +189,14 @@ class _Growing:
 
 
 def grow_tree_in_python(
-    model: Any, options: PomcpOptions, belief: Any, rng: np.random.Generator, root: Root
+    model: Any, options: PomcpOptions, belief: Any, rng: np.random.Generator, start: SearchTree
 ) -> tuple[SearchTree, int, int, int]:
     """(tree, simulations run, steps of the longest simulation in the tree, calls of step)."""
     numbered = isinstance(model, CompiledModel)
     source = (_CompiledAsPython if numbered else _PythonModel)(model, options, belief, rng)
-    tree, horizon = _Growing(root), options.horizon
+    tree, horizon = _Growing(start), options.horizon
     tree_depth = horizon if options.tree_depth is None else options.tree_depth
-    most = min(options.max_nodes, options.simulations + 1)
+    most = max(len(start), min(options.max_nodes, options.simulations + len(start)))
     deadline = None if options.seconds is None else time.perf_counter() + options.seconds
     done = deepest = steps = 0
     while done < options.simulations:

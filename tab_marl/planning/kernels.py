@@ -193,3 +193,54 @@ def search(
             edges[edge].visits += 1
             edges[edge].value += (leaf - edges[edge].value) / edges[edge].visits
     return len(particles)
+
+
+@njit(cache=True, nogil=True)
+def keep_matching(step, data, states, particles, action, observation, model_rng, state, kept, found):
+    """Steps the particles in turn and appends to `kept` those that gave the observation and did not end; returns how many."""
+    for i in range(len(particles)):
+        if found == len(kept):
+            break
+        state[:] = states[particles[i]]
+        seen, _reward, terminal = step(state, np.int64(action), data, model_rng)
+        if seen == observation and not terminal:
+            kept[found] = state
+            found += 1
+    return found
+
+
+@njit(cache=True)
+def copy_subtree(nodes, edges, edge_actions, root, keep, new_nodes, new_edges, new_actions, queue):
+    """Copies the tree below node `root`, breadth first; of the root's edges only actions with `keep` [A].
+
+    `queue` [nodes] is scratch. Returns (nodes, edges) copied.
+    """
+    queue[0] = root
+    new_nodes[0] = nodes[root]
+    new_nodes[0].sibling = NO_SIBLING
+    node_count = 1
+    edge_count = 0
+    done = 0
+    while done < node_count:
+        old = queue[done]
+        if nodes[old].first_edge != UNEXPANDED:
+            new_nodes[done].first_edge = edge_count
+            for edge in range(nodes[old].first_edge, nodes[old].first_edge + nodes[old].edge_count):
+                if done == 0 and not keep[edge_actions[edge]]:
+                    continue
+                new_edges[edge_count] = edges[edge]
+                new_actions[edge_count] = edge_actions[edge]
+                child = edges[edge].child
+                if child != NO_CHILD:
+                    new_edges[edge_count].child = node_count
+                while child != NO_CHILD:
+                    queue[node_count] = child
+                    new_nodes[node_count] = nodes[child]
+                    following = nodes[child].sibling
+                    new_nodes[node_count].sibling = node_count + 1 if following != NO_SIBLING else NO_SIBLING
+                    node_count += 1
+                    child = following
+                edge_count += 1
+            new_nodes[done].edge_count = edge_count - new_nodes[done].first_edge
+        done += 1
+    return node_count, edge_count

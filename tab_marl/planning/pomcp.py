@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from tab_marl.planning import kernels
 from tab_marl.planning.interpreted import asked_prior, grow_tree_in_python
 from tab_marl.planning.model import CompiledModel, action_names, belief_states, check_actions, draw_particles
-from tab_marl.planning.tree import EDGE, NODE, ROOT, SearchTree
+from tab_marl.planning.tree import ROOT, SearchTree
 
 _CHUNK = 256
 """Simulations between two looks at the clock."""
@@ -158,47 +158,55 @@ class Pomcp:
         prior_values: ArrayLike | None = None,
         prior_counts: ArrayLike | None = None,
         latest: tuple[int, int] | None = None,
+        start: SearchTree | None = None,
     ) -> Plan:
         """Searches from `belief` (states, `Particles` or a sampler) and returns the plan.
 
         `allowed` restricts the root: action numbers, or bool[A]. `prior_values` [A] with `prior_counts` [A] (or one count for
         all) start the root's actions as if tried that often with that mean return. Without them the model's own prior is asked
         if `latest` gives the (action, observation) that led here (for a compiled model, with the belief's first state).
+        `start` is a tree to go on with instead, such as ``plan.tree.after(action, observation)`` of the plan before.
         The same seed, model and belief give the identical tree (unless `seconds` is set).
         """
         generator = np.random.default_rng(rng)
         actions = self.model.actions
+        if start is not None and (prior_values is not None or prior_counts is not None or latest is not None):
+            raise ValueError("start goes without priors and latest: the tree already holds values")
         if prior_values is None and prior_counts is None and latest is not None:
             prior_values, prior_counts, open_actions = _asked_prior(self.model, belief, latest, generator)
             allowed = open_actions if allowed is None else np.intersect1d(open_actions, _numbers(actions, allowed))
-        root = _root(actions, allowed, prior_values, prior_counts)
+        if start is None:
+            start = _planted(actions, allowed, prior_values, prior_counts)
+        elif allowed is not None:
+            start = start.subtree(ROOT, _numbers(actions, allowed))
+        if not start.edges_of(ROOT) or start.edge_actions.max() >= actions:
+            raise ValueError(f"start is no tree of this model: its root needs actions, all in 0..{actions - 1}")
         started = time.perf_counter()
         if (
             isinstance(self.model, CompiledModel)
             and self.options.compiled
             and not getattr(numba.config, "DISABLE_JIT", 0)
         ):
-            tree, simulations, depth, steps = _grow_compiled(self.model, self.options, belief, generator, root)
+            tree, simulations, depth, steps = _grow_compiled(self.model, self.options, belief, generator, start)
         else:
-            tree, simulations, depth, steps = grow_tree_in_python(self.model, self.options, belief, generator, root)
+            tree, simulations, depth, steps = grow_tree_in_python(self.model, self.options, belief, generator, start)
         seconds = time.perf_counter() - started
         values = np.full(actions, -np.inf)
         visits = np.zeros(actions, dtype=np.int64)
-        at_root = tree.edges[: len(root[0])]
-        visits[root[0]] = at_root["visits"]
-        values[root[0]] = np.where(at_root["visits"] > 0, at_root["value"], -np.inf)
+        at_root = tree.edges[: tree.nodes["edge_count"][ROOT]]
+        chosen = tree.edge_actions[: len(at_root)]
+        visits[chosen] = at_root["visits"]
+        values[chosen] = np.where(at_root["visits"] > 0, at_root["value"], -np.inf)
         broken = (visits > 0) & ~np.isfinite(values)
         if broken.any():
             action = int(np.argmax(broken))
-            raise ValueError(f"action {action} has value {values[action]}: the model's rewards or rollouts are not all finite")
+            raise ValueError(
+                f"action {action} has value {values[action]}: the model's rewards or rollouts are not all finite"
+            )
         keys = (values, visits) if self.options.choose == "value" else (visits, values)
         best = np.flatnonzero(keys[0] == keys[0].max())
         action = int(best[np.argmax(keys[1][best])])
         return Plan(action, values, visits, simulations, depth, steps, seconds, tree, action_names(self.model))
-
-
-Root = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]
-"""Allowed actions ascending, and for each its prior value and pseudo-count."""
 
 
 def _numbers(actions: int, allowed: ArrayLike) -> NDArray[np.int64]:
@@ -227,7 +235,8 @@ def _asked_prior(
     return np.asarray(values, dtype=np.float64), np.maximum(counts, 0), np.flatnonzero(counts >= 0)
 
 
-def _root(actions: int, allowed: ArrayLike | None, values: ArrayLike | None, counts: ArrayLike | None) -> Root:
+def _planted(actions: int, allowed: ArrayLike | None, values: ArrayLike | None, counts: ArrayLike | None) -> SearchTree:
+    """A tree of a root only, with its allowed actions."""
     chosen = np.arange(actions) if allowed is None else _numbers(actions, allowed)
     if len(chosen) == 0:
         raise ValueError("allowed names no action: at least one must be allowed")
@@ -236,18 +245,18 @@ def _root(actions: int, allowed: ArrayLike | None, values: ArrayLike | None, cou
     if (values is None) != (counts is None):
         raise ValueError("prior_values and prior_counts go together: give both or neither")
     if values is None or counts is None:
-        return chosen, np.zeros(len(chosen)), np.zeros(len(chosen), dtype=np.int64)
+        return SearchTree.planted(chosen, np.zeros(len(chosen)), np.zeros(len(chosen), dtype=np.int64))
     v = np.broadcast_to(np.asarray(values, dtype=np.float64), (actions,))[chosen]
     n = np.broadcast_to(np.asarray(counts), (actions,)).astype(np.int64)[chosen]
     if (n < 0).any() or n.sum() > 2**30:
         raise ValueError(f"prior_counts holds {n.min()}..{n.max()}, must be >= 0 and sum to at most 2^30")
     if not np.isfinite(v[n > 0]).all():
         raise ValueError("prior_values must be finite where prior_counts > 0")
-    return chosen, np.where(n > 0, v, 0.0), n
+    return SearchTree.planted(chosen, np.where(n > 0, v, 0.0), n)
 
 
 def _grow_compiled(
-    model: CompiledModel, options: PomcpOptions, belief: Any, rng: np.random.Generator, root: Root
+    model: CompiledModel, options: PomcpOptions, belief: Any, rng: np.random.Generator, start: SearchTree
 ) -> tuple[SearchTree, int, int, int]:
     states, weights = belief_states(model, belief, options.simulations, rng)
     step, rollout, prior = model.functions
@@ -256,15 +265,13 @@ def _grow_compiled(
     words = rng.integers(2**64, size=2 + shared, dtype=np.uint64)
     tree_stream, model_stream, seeds = words[:1], words[1:2], words[2:]
 
-    most = min(options.max_nodes, options.simulations + 1)
-    size = min(most, _FIRST_NODES)
     # Every simulation adds at most one node and expands at most one.
-    nodes = np.empty(size, dtype=NODE)
-    edges = np.empty(size * actions + len(root[0]), dtype=EDGE)
-    edge_actions = np.empty(len(edges), dtype=np.int32)
-    used = np.zeros(5, dtype=np.int64)
-    plant_root(nodes, edges, edge_actions, root)
-    used[kernels.NODES], used[kernels.EDGES] = 1, len(root[0])
+    most = max(len(start), min(options.max_nodes, options.simulations + len(start)))
+    size = min(most, len(start) + _FIRST_NODES)
+    spare = len(start.edges)
+    nodes, edges = _grown(start.nodes, size), _grown(start.edges, size * actions + spare)
+    edge_actions = _grown(start.edge_actions, len(edges))
+    used = np.array([len(start), spare, 0, 0, 0])
     state = np.empty(model.state_size)
     path_edges = np.empty(horizon, dtype=np.int64)
     path_rewards = np.empty(horizon)
@@ -285,7 +292,7 @@ def _grow_compiled(
             if run < chunk:
                 size = min(most, 2 * len(nodes))
                 nodes = _grown(nodes, size)
-                edges = _grown(edges, size * actions + len(root[0]))
+                edges = _grown(edges, size * actions + spare)
                 edge_actions = _grown(edge_actions, len(edges))
         done += chunk
         if deadline is not None and time.perf_counter() >= deadline:
@@ -296,16 +303,6 @@ def _grow_compiled(
 
 def _tree_depth(options: PomcpOptions) -> int:
     return options.horizon if options.tree_depth is None else min(options.tree_depth, options.horizon)
-
-
-def plant_root(nodes: NDArray[np.void], edges: NDArray[np.void], edge_actions: NDArray[np.int32], root: Root) -> None:
-    chosen, values, counts = root
-    n = len(chosen)
-    nodes[ROOT] = (0, kernels.NO_SIBLING, counts.sum(), 0, n)
-    edges["value"][:n] = values
-    edges["visits"][:n] = counts
-    edges["child"][:n] = kernels.NO_CHILD
-    edge_actions[:n] = chosen
 
 
 def _grown(array: NDArray[Any], size: int) -> NDArray[Any]:

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.planning.kernels import NO_CHILD, NO_SIBLING, UNEXPANDED
+from tab_marl.planning.kernels import NO_CHILD, NO_SIBLING, UNEXPANDED, copy_subtree
 
 ROOT = 0
 NO_PARENT = -1
@@ -51,6 +51,14 @@ class SearchTree:
     """``[edges]``."""
     observations: tuple[object, ...] | None = None
     """What observation number i was, where the model is plain Python (else observations are numbers already)."""
+
+    @classmethod
+    def planted(cls, actions: NDArray[np.int64], values: NDArray[np.float64], visits: NDArray[np.int64]) -> SearchTree:
+        """A root with these actions, as if tried `visits` times with that mean return."""
+        nodes, edges = np.empty(1, dtype=NODE), np.empty(len(actions), dtype=EDGE)
+        nodes[ROOT] = (0, NO_SIBLING, visits.sum(), 0, len(actions))
+        edges["value"], edges["visits"], edges["child"] = values, visits, NO_CHILD
+        return cls(nodes, edges, actions.astype(np.int32))
 
     def __len__(self) -> int:
         return len(self.nodes)
@@ -100,6 +108,28 @@ class SearchTree:
             more = following != NO_SIBLING
             edge, node = edge[more], following[more]
         return parents
+
+    def after(self, action: int, observation: object) -> SearchTree | None:
+        """The tree below the node that action and observation lead to, for the next plan; None where nothing was learnt."""
+        try:
+            node = self.child(ROOT, action, observation)
+        except KeyError:
+            return None
+        return None if node == NO_CHILD or not self.edges_of(node) else self.subtree(node)
+
+    def subtree(self, node: int, allowed: NDArray[np.int64] | None = None) -> SearchTree:
+        """A copy of the tree below a node, which becomes the root; of the root's actions only those `allowed`."""
+        self._check(node)
+        keep = np.ones(int(self.edge_actions.max(initial=0)) + 1, dtype=np.bool_)
+        if allowed is not None:
+            keep[:] = False
+            keep[allowed[allowed < len(keep)]] = True
+        nodes, edges, actions = np.empty_like(self.nodes), np.empty_like(self.edges), np.empty_like(self.edge_actions)
+        queue = np.empty(len(self.nodes), dtype=np.int64)
+        n, e = copy_subtree(self.nodes, self.edges, self.edge_actions, node, keep, nodes, edges, actions, queue)
+        nodes["observation"][ROOT] = 0  # as in a fresh tree: what led to the root is no part of it
+        nodes["visits"][ROOT] = edges["visits"][: nodes["edge_count"][ROOT]].sum()
+        return SearchTree(nodes[:n].copy(), edges[:e].copy(), actions[:e].copy(), self.observations)
 
     def best_edge(self, node: int) -> int | None:
         """The tried edge of greatest value (ties: more visits, then the lower action); None at a leaf."""

@@ -13,6 +13,7 @@ import pytest
 
 from tab_marl.planning import pomcp as pomcp_module
 from tab_marl.planning import textbook
+from tab_marl.planning.belief import BeliefDepleted, update_particles
 from tab_marl.planning.model import CompiledModel, Particles, table_model
 from tab_marl.planning.pomcp import Pomcp, PomcpOptions
 from tab_marl.planning.random_kernels import uniform
@@ -255,6 +256,85 @@ def test_time_is_bounded():
     plan = planner.plan(belief, 8)
     assert 0.05 <= plan.seconds < 2.0
     assert 256 <= plan.simulations < 10**8
+
+
+# ---- going on with a tree
+
+
+def rebuilt(tree, node):
+    """The tree below a node as nested tuples, whatever its numbering."""
+    return tuple(
+        (
+            int(tree.edge_actions[e]),
+            float(tree.edges["value"][e]),
+            int(tree.edges["visits"][e]),
+            tuple((tree.observation(c), rebuilt(tree, c)) for c in tree.children(e)),
+        )
+        for e in tree.edges_of(node)
+    )
+
+
+def test_the_tree_after_a_step_is_the_part_below_it():
+    plan = Pomcp(textbook.tag(), PomcpOptions(simulations=2000)).plan([[3, 9], [3, 20]], 1)
+    action, seen = plan.tree.best_line()[0]
+    node = plan.tree.child(ROOT, action, seen)
+    after = plan.tree.after(action, seen)
+    assert rebuilt(after, ROOT) == rebuilt(plan.tree, node)
+    assert after.nodes["visits"][ROOT] == sum(after.edges["visits"][e] for e in after.edges_of(ROOT))
+    assert (after.parent_edge[1:] >= 0).all()
+    assert plan.tree.after(action, 12345) is None
+    some = after.subtree(ROOT, np.array([1, 4]))
+    assert [int(a) for a in some.edge_actions[:2]] == [1, 4]
+    assert rebuilt(some, ROOT) == tuple(part for part in rebuilt(after, ROOT) if part[0] in (1, 4))
+
+
+def test_a_search_goes_on_with_a_tree():
+    options = PomcpOptions(simulations=600)
+    planner = Pomcp(textbook.tag(), options)
+    before = planner.plan([[3, 9], [3, 20]], 1)
+    action, seen = before.tree.best_line()[0]
+    after = before.tree.after(action, seen)
+    held = int(after.nodes["visits"][ROOT])
+    assert held > 50
+    belief = [[seen, 9], [seen, 21]]
+    plan = planner.plan(belief, 2, start=after)
+    assert plan.visits.sum() == 600 + held
+    slow = Pomcp(textbook.tag(), dataclasses.replace(options, compiled=False)).plan(belief, 2, start=after)
+    assert same_tree(plan.tree, slow.tree)
+    assert len(after) == len(before.tree.after(action, seen))  # the tree handed over is not changed
+    fewer = planner.plan(belief, 2, start=after, allowed=[0, 1])
+    assert (fewer.visits > 0).tolist() == [True, True, False, False, False]
+    with pytest.raises(ValueError, match="start goes without priors"):
+        planner.plan(belief, 2, start=after, prior_values=1.0, prior_counts=1)
+
+
+def test_a_plain_python_search_goes_on_with_a_tree():
+    planner = Pomcp(PlainTiger(), PomcpOptions(simulations=300, exploration=100.0, max_depth=4))
+    after = planner.plan(["left", "right"], 0).tree.after(0, "hear left")
+    held = int(after.nodes["visits"][ROOT])
+    assert planner.plan(["left"], 0, start=after).visits.sum() == 300 + held
+
+
+# ---- particles
+
+
+def test_rejection_agrees_with_bayes():
+    model, rng = textbook.tag(), np.random.default_rng(0)
+    states = update_particles(
+        model, np.column_stack([np.full(29, 4), np.arange(29)]), textbook.EAST, 5, rng, count=20000
+    )
+    exact = textbook.TagBelief(4).updated(model.data, textbook.EAST, 5)
+    assert (states[:, 0] == 5).all()
+    assert np.abs(np.bincount(states[:, 1].astype(int), minlength=29) / 20000 - exact.target).max() < 0.01
+
+
+def test_a_belief_that_runs_dry_says_so():
+    model, rng = textbook.tag(), np.random.default_rng(0)
+    with pytest.raises(BeliefDepleted, match="none of 500 simulated steps of action 1 gave observation 28"):
+        update_particles(model, [[4, 9]], textbook.EAST, 28, rng, tries=500)
+    few = update_particles(model, [[4, 9]], textbook.EAST, 5, rng, count=100, tries=10)
+    assert few.shape == (100, 2)
+    assert len(np.unique(few, axis=0)) <= 10
 
 
 # ---- priors, restrictions, scenarios
