@@ -31,7 +31,7 @@ DIRECT = "direct"
 OWN_FIGURE = {
     "side": "side taken as drawn",
     "via": "via points reached",
-    "camera-shy": "seconds in cameras",
+    "camera-shy": "seconds under other cameras",
     "late": "time used / allowed",
     "wander": "spread between episodes, metres",
     "fickle": "other places than the direct policy's",

@@ -122,7 +122,9 @@ def style_figures(bank: Bank, rollouts: Rollouts, again: Rollouts | None = None)
     figures = {
         "side taken as drawn": _mean([_side_match(tasks[i], _path(rollouts, i)) for i in done]),
         "via points reached": _mean([_via_reached(tasks[i], _path(rollouts, i)) for i in done]),
-        "seconds in cameras": _mean([_camera_seconds(tasks[i], _path(rollouts, i)) for i in done]),
+        "seconds under other cameras": _mean(
+            [_other_camera_seconds(tasks[i], _path(rollouts, i), rollouts.places[i]) for i in done]
+        ),
         "time used / allowed": _mean([_time_share(tasks[i], int(rollouts.end[i])) for i in done]),
         "length / shortest": _mean([_stretch(tasks[i], _path(rollouts, i)) for i in done]),
         "touches per episode": float(rollouts.touches.mean()),
@@ -167,8 +169,13 @@ def _via_reached(task: AdversaryTask, path: NDArray[np.float64]) -> float:
     return float(all((np.hypot(*(path - point).T) <= VIA_METRES).any() for point in task.parts.via))
 
 
-def _camera_seconds(task: AdversaryTask, path: NDArray[np.float64]) -> float:
-    return float(task.scenario.seen(path).sum()) / task.scenario.control_hertz
+def _other_camera_seconds(task: AdversaryTask, path: NDArray[np.float64], visited: Sequence[str]) -> float:
+    """Seconds under the cameras of checkpoints that were not visited: those that a way can avoid."""
+    seen = np.zeros(len(path), dtype=bool)
+    for checkpoint in task.scenario.checkpoints:
+        if checkpoint.name not in visited:
+            seen |= checkpoint.camera.contains(path)
+    return float(seen.sum()) / task.scenario.control_hertz
 
 
 def _time_share(task: AdversaryTask, end: int) -> float:

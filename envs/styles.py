@@ -37,7 +37,7 @@ class Style:
     name: str = "direct"
     side: float = 0.0
     """Probability that the adversary prefers one turning sense about the arena's centre (either, with equal chance)."""
-    side_cost: float = 1.5
+    side_cost: float = 3.0
     """Moves against the preferred sense cost up to 1 + this."""
     via: float = 0.0
     """Probability that a detour over `via_points_max` or fewer points comes first."""
