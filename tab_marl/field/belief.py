@@ -7,12 +7,16 @@ never crashes: it falls back, and counts.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tab_marl.field import kernels
 from tab_marl.field.chain import ProductChain
+
+if TYPE_CHECKING:
+    from tab_marl.field.sampling import Trajectories
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,9 @@ EXACT = BeliefOptions(drop_row=0.0, drop_entry=0.0)
 
 class ProductBelief:
     """Probability mass on (q, s), normalised after every call."""
+
+    bridges = True
+    """Whether the chain's own kernel moves it; else `sample_paths` asks the belief for its futures."""
 
     def __init__(self, chain: ProductChain, options: BeliefOptions | None = None) -> None:
         """The belief at tick 0: cells by `chain.start`, modes and feasibility by h (the law P(s0) = mu0 binds cells)."""
@@ -230,6 +237,10 @@ class ProductBelief:
         out = np.zeros(len(self.chain.delta))
         out[self.automaton_states] = self.masses.sum(axis=1)
         return out
+
+    def futures(self, rng: np.random.Generator, count: int, ticks: int, jitter: bool) -> Trajectories:
+        """`sample_paths` for beliefs that do not bridge."""
+        raise NotImplementedError
 
     @property
     def completed(self) -> float:

@@ -18,7 +18,7 @@ from tab_marl.field.problem import FieldProblem
 Floats = NDArray[np.float64]
 UNUSED = -1
 UNREACHABLE, PATH_DEPENDENT = -2, -3
-HISTORY = 6
+MEMORY = 6
 
 
 def ticks_of(problem: FieldProblem) -> NDArray[np.int64]:
@@ -106,12 +106,13 @@ class Tilt:
         """``[B]`` expected visits by branch, from expected transitions ``[Q, L]``."""
         branch = self.problem.automaton.branch
         used = branch >= 0
-        return np.bincount(branch[used], flux[used], minlength=len(self.log_branch))
+        return np.asarray(np.bincount(branch[used], flux[used], minlength=len(self.log_branch)), dtype=np.float64)
 
     def completions(self, flux: Floats) -> Floats:
         """``[ticks]`` probability of completing at each tick (timing prior only)."""
         used = self.completion_tick >= 0
-        return np.bincount(self.completion_tick[used], flux[used], minlength=len(self.log_tick))
+        ticks = np.bincount(self.completion_tick[used], flux[used], minlength=len(self.log_tick))
+        return np.asarray(ticks, dtype=np.float64)
 
     def completed(self, flux: Floats) -> float:
         into = self.problem.automaton.delta == self.problem.automaton.accepting
@@ -163,6 +164,12 @@ class Tilt:
             parts.append(np.array([-odds]))
         return np.concatenate(parts) if parts else np.empty(0)
 
+    def start_from(self, other: Tilt) -> None:
+        """Take over the weights of the branches and of failure, fitted on another grid."""
+        self.log_branch[:] = other.log_branch
+        if np.isfinite(self.log_failure):
+            self.log_failure = other.log_failure
+
     def get(self) -> Floats:
         """The free logarithmic weights as one vector, in the order of `residual`."""
         parts = [self.log_branch[group] for group in self.branch_groups]
@@ -209,48 +216,60 @@ def alternatives(problem: FieldProblem) -> list[NDArray[np.int64]]:
     return [group for group in groups if len(group) > 1]
 
 
-def fit(tilt: Tilt, pass_both_ways: Callable[[Tilt], Floats]) -> tuple[Floats, float, int]:
+@dataclass(eq=False)
+class History:
+    """What earlier rounds taught: how the step (log target / present) changes with the weights."""
+
+    moved: list[Floats]
+    changed: list[Floats]
+
+    def propose(self, step: Floats) -> Floats:
+        """The next move: the plain scaling step, corrected by least squares over the known changes (Anderson 1965)."""
+        if not self.moved or len(self.moved[0]) != len(step):
+            return step
+        moved, changed = np.stack(self.moved, axis=1), np.stack(self.changed, axis=1)
+        share = np.linalg.lstsq(changed, step, rcond=1e-10)[0]
+        correction = (moved + changed) @ share
+        if not np.isfinite(correction).all() or np.abs(correction).max() > 4 * max(1.0, float(np.abs(step).max())):
+            return step
+        return np.asarray(step - correction)
+
+    def learn(self, moved: Floats, changed: Floats) -> None:
+        self.moved.append(moved)
+        self.changed.append(changed)
+        del self.moved[:-MEMORY], self.changed[:-MEMORY]
+
+
+def fit(
+    tilt: Tilt, pass_both_ways: Callable[[Tilt], Floats], history: History | None = None
+) -> tuple[Floats, float, int, History]:
     """Fit the weights in place; ``pass_both_ways(tilt)`` returns the expected transitions ``[Q, L]`` under them.
 
-    Returns the last such table, the largest relative error of a constrained expectation, and the rounds taken.
+    Returns the last such table, the largest relative error of a constrained expectation, the rounds taken, and what was
+    learnt, which speeds up the fit of a similar problem.
     """
     options = tilt.problem.options
+    history = history or History([], [])
     flux = pass_both_ways(tilt)
     before = tilt.log_tick.copy()
     tilt.drop_infeasible(flux)
     if not np.array_equal(before, tilt.log_tick):
         flux = pass_both_ways(tilt)
-    points: list[Floats] = []
-    steps: list[Floats] = []
-    best = (np.inf, tilt.get(), flux)
-    for round_ in range(1, options.max_iterations + 1):
-        step = tilt.residual(flux)
+    best, best_error = tilt.get(), np.inf
+    step = tilt.residual(flux)
+    for rounds in range(1, options.max_iterations + 1):
         error = float(np.abs(np.expm1(np.clip(step, -50, 50))).max(initial=0.0))
-        if error < best[0]:
-            best = (error, tilt.get(), flux)
-        if error <= options.marginal_tolerance or round_ == options.max_iterations:
+        if error < best_error:
+            best, best_error = tilt.get(), error
+        if error <= options.marginal_tolerance or rounds == options.max_iterations:
             break
-        points.append(tilt.get())
-        steps.append(step)
-        del points[:-HISTORY], steps[:-HISTORY]
-        tilt.put(_anderson(points, steps))
+        here = tilt.get()
+        tilt.put(here + history.propose(step))
         flux = pass_both_ways(tilt)
-    if error > best[0]:
-        tilt.put(best[1])
+        following = tilt.residual(flux)
+        history.learn(tilt.get() - here, following - step)
+        step = following
+    if error > best_error:
+        tilt.put(best)
         flux = pass_both_ways(tilt)
-    return flux, best[0], round_
-
-
-def _anderson(points: list[Floats], steps: list[Floats]) -> Floats:
-    """The next point: the plain step, corrected by the least-squares combination of the latest differences."""
-    plain = points[-1] + steps[-1]
-    if len(points) < 2:
-        return plain
-    moved = np.stack([points[-1] - p for p in points[:-1]], axis=1)
-    changed = np.stack([steps[-1] - s for s in steps[:-1]], axis=1)
-    share = np.linalg.lstsq(changed, steps[-1], rcond=1e-10)[0]
-    correction = (moved + changed) @ share
-    limit = 4 * max(1.0, float(np.abs(steps[-1]).max()))
-    if not np.isfinite(correction).all() or np.abs(correction).max() > limit:
-        return plain
-    return np.asarray(plain - correction)
+    return flux, best_error, rounds, history

@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Compiled loops of the field: backward messages, pushing mass forward, sampling trajectories.
 
 Arrays and scalars only; nothing here validates or raises. Each has a slow twin in ``tests/field/slow.py``.

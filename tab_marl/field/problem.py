@@ -26,6 +26,9 @@ Transitions = Reference | sparse.sparray | sparse.spmatrix | NDArray[np.float64]
 
 CELL_SIZES_METRES = (0.05, 0.1)
 """Tried in this order when `FieldOptions.cell_metres` is None."""
+ROUGH_CELL_METRES = 0.15
+ROUGH_FROM = 1_500_000
+"""Automaton states x base states from which a first fit on rough cells saves time."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +117,8 @@ class FieldProblem:
     """Names of the automaton's branches, for people."""
     earliest_tick: ArrayLike = 0
     """``[C]`` or one number: no completion before this tick, from this start cell, is feasible for the timing prior."""
+    rough: FieldProblem | None = None
+    """The same on coarser cells, on which the weights of goal marginals are fitted first; None to do without."""
 
     def __post_init__(self) -> None:
         motion = self.transitions if isinstance(self.transitions, Reference) else from_matrices(self.transitions)
@@ -179,23 +184,40 @@ class FieldProblem:
         options = options or FieldOptions()
         horizon = scenario.horizon_ticks if horizon_ticks is None else horizon_ticks
         compiled = compile_mission(mission, scenario, scenario.step_seconds)
+        tumbling = options.reference == "run_and_tumble"
         sizes = CELL_SIZES_METRES if options.cell_metres is None else (options.cell_metres,)
         for size in sizes:
             grid = GridMap.from_scenario(scenario, size)
-            masks = compiled.masks(grid.centres)
-            automaton = unroll(compiled, horizon, masks)
-            directions = options.headings if options.reference == "run_and_tumble" else 0
+            automaton = unroll(compiled, horizon, compiled.masks(grid.centres))
             entries = len(automaton.delta) * grid.cells
-            if entries * (directions + 1) <= options.state_budget:
+            if entries * (options.headings + 1 if tumbling else 1) <= options.state_budget:
                 break
-        while options.cell_metres is None and directions >= 16 and entries * (directions + 1) > options.state_budget:
-            directions //= 2
-        if directions:
-            options = replace(options, headings=directions)
+        while options.cell_metres is None and tumbling and options.headings >= 16:
+            if entries * (options.headings + 1) <= options.state_budget:
+                break
+            options = replace(options, headings=options.headings // 2)
+        problem = cls._on_grid(compiled, grid, automaton, scenario, options, horizon)
+        if tumbling and entries * (options.headings + 1) > ROUGH_FROM and grid.cell_metres < ROUGH_CELL_METRES:
+            rough = GridMap.from_scenario(scenario, ROUGH_CELL_METRES)
+            automaton = unroll(compiled, horizon, compiled.masks(rough.centres))
+            coarse = replace(options, headings=8)
+            return replace(problem, rough=cls._on_grid(compiled, rough, automaton, scenario, coarse, horizon))
+        return problem
+
+    @classmethod
+    def _on_grid(
+        cls,
+        compiled: MissionAutomaton,
+        grid: GridMap,
+        automaton: TickAutomaton,
+        scenario: Scenario,
+        options: FieldOptions,
+        horizon: int,
+    ) -> FieldProblem:
         motion, which = _motion(grid, scenario, options, automaton.speed_limit)
         return cls(
             motion,
-            automaton.symbols(masks),
+            automaton.symbols(compiled.masks(grid.centres)),
             automaton,
             start_cells(grid, scenario),
             horizon,

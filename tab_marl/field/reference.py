@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -132,7 +132,7 @@ class Reference:
 
 
 def from_matrices(
-    transitions: object,
+    transitions: Any,
     mix: ArrayLike | None = None,
     headings: ArrayLike | None = None,
     jump: ArrayLike | None = None,
@@ -148,7 +148,7 @@ def from_matrices(
     Raises:
         ValueError: an entry is negative or not finite, a row sums to more than 1, or the shapes do not fit.
     """
-    stack: Sequence[object]
+    stack: Sequence[Any]
     if isinstance(transitions, Sequence):
         stack = transitions
     elif isinstance(transitions, np.ndarray) and transitions.ndim == 3:

@@ -43,6 +43,8 @@ def sample_paths(
     """
     if count < 1 or ticks < 0:
         raise ValueError(f"count is {count} and ticks is {ticks}: need count >= 1 and ticks >= 0")
+    if not belief.bridges:
+        return belief.futures(rng, count, ticks, jitter)
     masses = belief.masses
     slots, first = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
     kernels.draw_states(masses, float(masses.sum(dtype=np.float64)), count, rng.random(), slots, first)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tab_marl.field import kernels
 from tab_marl.field.chain import ProductChain, product_chain
-from tab_marl.field.constraints import Tilt, fit
+from tab_marl.field.constraints import History, Tilt, fit
 from tab_marl.field.problem import FieldProblem
 from tab_marl.field.tab_field import TabField, expected_transitions, start_log_partition
 
@@ -40,20 +40,30 @@ def solve(problem: FieldProblem) -> TabField:
 
 def _solve(problem: FieldProblem) -> TabField:
     tilt = Tilt.of(problem)
-    flux: Floats | None = None
-    error, rounds = 0.0, 1
     if not tilt.needed:
-        chain = message(problem, tilt)
-    else:
-        latest: list[ProductChain] = []
-
-        def pass_both_ways(current: Tilt) -> Floats:
-            latest[:] = [message(problem, current)]
-            return expected_transitions(latest[0], problem.automaton.rank)
-
-        flux, error, rounds = fit(tilt, pass_both_ways)
-        chain = latest[0]
+        return TabField(problem, message(problem, tilt), tilt, None, 0.0, 1)
+    history: History | None = None
+    if problem.rough is not None and not problem.options.timing_prior:
+        rough = Tilt.of(problem.rough)
+        try:
+            _, _, _, history, _ = _fitted(problem.rough, rough, None)
+            tilt.start_from(rough)
+        except InfeasibleField:  # rough cells may close a gap
+            history = None
+    flux, error, rounds, _, chain = _fitted(problem, tilt, history)
     return TabField(problem, chain, tilt, flux, error, rounds)
+
+
+def _fitted(
+    problem: FieldProblem, tilt: Tilt, history: History | None
+) -> tuple[Floats, float, int, History, ProductChain]:
+    latest: list[ProductChain] = []
+
+    def pass_both_ways(current: Tilt) -> Floats:
+        latest[:] = [message(problem, current)]
+        return expected_transitions(latest[0], problem.automaton.rank)
+
+    return *fit(tilt, pass_both_ways, history), latest[0]
 
 
 def message(problem: FieldProblem, tilt: Tilt) -> ProductChain:

@@ -104,29 +104,33 @@ class TabField:
         return {name: float(v / t) if t > 0 else 0.0 for name, v, t in zip(names, visits, total, strict=True)}
 
     @cached_property
-    def _over_time(self) -> tuple[Floats, Floats]:
+    def occupancy_by_status(self) -> Floats:
+        """``[T + 1, 2, C]``: probability of each cell at each tick with the mission under way (0) or complete (1)."""
         belief = ProductBelief(self.bridge, EXACT if self.problem.options.precision == "double" else None)
-        occupancy = np.empty((self.problem.horizon + 1, self.bridge.cells))
-        completed = np.empty(self.problem.horizon + 1)
+        table = np.zeros((self.problem.horizon + 1, 2, self.bridge.cells))
         for t in range(self.problem.horizon + 1):
             if t:
                 belief.predict()
-            occupancy[t] = belief.cell_marginal()
-            completed[t] = belief.completed
-        return occupancy, completed
+            for q, mass in zip(belief.automaton_states, belief.masses, strict=True):
+                table[t, int(q == self.bridge.accepting)] += mass.reshape(self.bridge.cells, -1).sum(axis=1)
+        return table
 
-    @property
+    @cached_property
     def occupancy(self) -> Floats:
         """``[T + 1, C]``: probability of each cell at each tick; after completion the reference process goes on."""
-        return self._over_time[0]
+        return self.occupancy_by_status.sum(axis=1)
 
-    @property
+    @cached_property
     def completion_probability(self) -> Floats:
         """``[T + 1]``: probability that the mission is complete by each tick."""
-        return self._over_time[1]
+        return self.occupancy_by_status[:, 1].sum(axis=1)
 
     def belief(self) -> ProductBelief:
         """A fresh filter at tick 0."""
+        if self.problem.options.kernel == "marginal":
+            from tab_marl.field.marginal import MarginalBelief
+
+            return MarginalBelief(self)
         return ProductBelief(self.chain)
 
     def sample(self, rng: np.random.Generator, count: int, ticks: int | None = None) -> Trajectories:

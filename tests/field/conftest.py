@@ -167,22 +167,22 @@ def mission_runner(mission, scenario, grid):
 
 def tiny(speed: float = 1.0, **changes) -> Scenario:
     """3 x 3 cells of 1 m, ticks of 1 s: A upper left, B upper right, C middle right, start in the lower row."""
-    settings = dict(
-        name="tiny",
-        checkpoints=(
+    settings = {
+        "name": "tiny",
+        "checkpoints": (
             Checkpoint("Checkpoint A", 0.5, 2.5, 0.2, 0.4),
             Checkpoint("Checkpoint B", 2.5, 2.5, 0.2, 0.4),
             Checkpoint("Checkpoint C", 2.5, 1.5, 0.2, 0.4),
         ),
-        ego_start=Box(2, 2, 3, 3),
-        adversary_start=Box(0, 0, 2, 1),
-        adversary=Robot(radius_metres=0.01, max_speed=speed),
-        step_seconds=1.0,
-        horizon_seconds=5.0,
-        central_zone_metres=0.3,
-        exact_seconds=0.5,
-        exact_fraction=0.0,
-    )
+        "ego_start": Box(2, 2, 3, 3),
+        "adversary_start": Box(0, 0, 2, 1),
+        "adversary": Robot(radius_metres=0.01, max_speed=speed),
+        "step_seconds": 1.0,
+        "horizon_seconds": 5.0,
+        "central_zone_metres": 0.3,
+        "exact_seconds": 0.5,
+        "exact_fraction": 0.0,
+    }
     return Scenario(**(settings | changes))
 
 

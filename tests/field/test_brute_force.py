@@ -26,14 +26,19 @@ MISSIONS = {
     ),
 }  # fmt: skip
 REFERENCES = {
-    "paper_walk": dict(reference="paper_walk"),
-    "walk": dict(reference="walk"),
-    "run_and_tumble": dict(reference="run_and_tumble", headings=4, mean_run_metres=2.0),
+    "paper_walk": {"reference": "paper_walk"},
+    "walk": {"reference": "walk"},
+    "run_and_tumble": {"reference": "run_and_tumble", "headings": 4, "mean_run_metres": 2.0},
 }
 
 
 def problem_of(mission, scenario, reference, **options):
-    settings = dict(cell_metres=1.0, goal_marginals=False, precision="double", marginal_tolerance=1e-14) | options
+    settings = {
+        "cell_metres": 1.0,
+        "goal_marginals": False,
+        "precision": "double",
+        "marginal_tolerance": 1e-14,
+    } | options
     return FieldProblem.from_mission(mission, scenario, FieldOptions(**(REFERENCES[reference] | settings)))
 
 
