@@ -29,6 +29,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
+import numba
 import numpy as np
 from numba import typeof, types
 from numpy.typing import ArrayLike, NDArray
@@ -66,6 +67,8 @@ class CompiledModel:
     @cached_property
     def functions(self) -> tuple[Any, Any, Any]:
         """step, rollout and prior compiled for this type of data (rollout and prior may be None)."""
+        if getattr(numba.config, "DISABLE_JIT", 0):
+            return self.step, self.rollout, self.prior
         data = typeof(self.data)
         step = callback(_plain(self.step), _STEP_RESULT(_STATE, types.int64, data, _RNG))
         rollout = prior = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 import pytest
 
@@ -86,6 +87,7 @@ def test_the_belief_agrees_with_counting_simulations():
         TagBelief(0, np.eye(29)[19]).updated(model.data, EAST, SEES_TARGET)
 
 
+@pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="takes hours interpreted")
 def test_planning_plays_tag_better_than_its_own_rollout():
     model = tag()
     planner = Pomcp(model, PomcpOptions(simulations=500, exploration=10.0))
