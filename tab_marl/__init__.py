@@ -86,3 +86,12 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted(__all__)
+
+
+def _register_environments() -> None:
+    from tab_marl.envs.registration import register_all
+
+    register_all()
+
+
+_register_environments()
