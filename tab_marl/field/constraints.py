@@ -1,13 +1,11 @@
 """Constraints beyond the mission: equal goal marginals, uniform completion tick, completion with probability c.
 
 Each is a set of expectations under P. The minimiser of KL(P || Q) is then Q times a product of weights on transitions of
-the automaton (exponential tilting), and the weights are found by iterative proportional scaling, accelerated after
-Anderson (1965): each round is one backward and one forward pass.
+the automaton (exponential tilting); `fitting` finds them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +16,6 @@ from tab_marl.field.problem import FieldProblem
 Floats = NDArray[np.float64]
 UNUSED = -1
 UNREACHABLE, PATH_DEPENDENT = -2, -3
-MEMORY = 6
 
 
 def ticks_of(problem: FieldProblem) -> NDArray[np.int64]:
@@ -90,6 +87,11 @@ class Tilt:
     def needed(self) -> bool:
         """Whether anything has to be fitted."""
         return bool(self.branch_groups) or self.completion_tick.max(initial=-1) >= 0 or np.isfinite(self.log_failure)
+
+    @property
+    def branches(self) -> int:
+        """How many branches are constrained."""
+        return sum(len(group) for group in self.branch_groups)
 
     def log_weight(self) -> Floats:
         """``[Q, L]``: log of the factor on each transition."""
@@ -164,6 +166,17 @@ class Tilt:
             parts.append(np.array([-odds]))
         return np.concatenate(parts) if parts else np.empty(0)
 
+    @property
+    def scaling_is_exact(self) -> bool:
+        """Whether every completing trajectory takes exactly one branch of one set, as its last step.
+
+        One scaling step then meets the targets, but for what differs between start cells.
+        """
+        if len(self.branch_groups) != 1 or len(self.log_tick) or np.isfinite(self.log_failure):
+            return False
+        automaton = self.problem.automaton
+        return bool((automaton.delta[np.isin(automaton.branch, self.branch_groups[0])] == automaton.accepting).all())
+
     def start_from(self, other: Tilt) -> None:
         """Take over the weights of the branches and of failure, fitted on another grid."""
         self.log_branch[:] = other.log_branch
@@ -214,62 +227,3 @@ def alternatives(problem: FieldProblem) -> list[NDArray[np.int64]]:
     roots = np.array([root(b) for b in range(len(parent))], dtype=np.int64)
     groups = [np.flatnonzero(roots == r) for r in np.unique(roots)]
     return [group for group in groups if len(group) > 1]
-
-
-@dataclass(eq=False)
-class History:
-    """What earlier rounds taught: how the step (log target / present) changes with the weights."""
-
-    moved: list[Floats]
-    changed: list[Floats]
-
-    def propose(self, step: Floats) -> Floats:
-        """The next move: the plain scaling step, corrected by least squares over the known changes (Anderson 1965)."""
-        if not self.moved or len(self.moved[0]) != len(step):
-            return step
-        moved, changed = np.stack(self.moved, axis=1), np.stack(self.changed, axis=1)
-        share = np.linalg.lstsq(changed, step, rcond=1e-10)[0]
-        correction = (moved + changed) @ share
-        if not np.isfinite(correction).all() or np.abs(correction).max() > 4 * max(1.0, float(np.abs(step).max())):
-            return step
-        return np.asarray(step - correction)
-
-    def learn(self, moved: Floats, changed: Floats) -> None:
-        self.moved.append(moved)
-        self.changed.append(changed)
-        del self.moved[:-MEMORY], self.changed[:-MEMORY]
-
-
-def fit(
-    tilt: Tilt, pass_both_ways: Callable[[Tilt], Floats], history: History | None = None
-) -> tuple[Floats, float, int, History]:
-    """Fit the weights in place; ``pass_both_ways(tilt)`` returns the expected transitions ``[Q, L]`` under them.
-
-    Returns the last such table, the largest relative error of a constrained expectation, the rounds taken, and what was
-    learnt, which speeds up the fit of a similar problem.
-    """
-    options = tilt.problem.options
-    history = history or History([], [])
-    flux = pass_both_ways(tilt)
-    before = tilt.log_tick.copy()
-    tilt.drop_infeasible(flux)
-    if not np.array_equal(before, tilt.log_tick):
-        flux = pass_both_ways(tilt)
-    best, best_error = tilt.get(), np.inf
-    step = tilt.residual(flux)
-    for rounds in range(1, options.max_iterations + 1):
-        error = float(np.abs(np.expm1(np.clip(step, -50, 50))).max(initial=0.0))
-        if error < best_error:
-            best, best_error = tilt.get(), error
-        if error <= options.marginal_tolerance or rounds == options.max_iterations:
-            break
-        here = tilt.get()
-        tilt.put(here + history.propose(step))
-        flux = pass_both_ways(tilt)
-        following = tilt.residual(flux)
-        history.learn(tilt.get() - here, following - step)
-        step = following
-    if error > best_error:
-        tilt.put(best)
-        flux = pass_both_ways(tilt)
-    return flux, best_error, rounds, history

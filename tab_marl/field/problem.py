@@ -55,7 +55,7 @@ class FieldOptions:
     """Of the stored messages; the work is always done in double precision."""
     state_budget: int = 8_000_000
     """Automaton states x cells x modes up to which finer cells are preferred."""
-    marginal_tolerance: float = 0.02
+    marginal_tolerance: float = 0.05
     """Relative error at which goal marginals, timing prior and completion probability are met."""
     max_iterations: int = 60
     """Of the fit of their weights."""

@@ -8,9 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tab_marl.field import kernels
+from tab_marl.field.belief import ProductBelief
 from tab_marl.field.chain import ProductChain, product_chain
-from tab_marl.field.constraints import History, Tilt, fit
+from tab_marl.field.constraints import Tilt
+from tab_marl.field.fitting import History, fit
 from tab_marl.field.problem import FieldProblem
+from tab_marl.field.sampling import Trajectories, sample_paths
 from tab_marl.field.tab_field import TabField, expected_transitions, start_log_partition
 
 Floats = NDArray[np.float64]
@@ -18,6 +21,10 @@ Floats = NDArray[np.float64]
 # Rows of messages are scaled to these maxima, to use the whole range of the number format: 68 and 600 decades below.
 # Powers of 2, so that scaling rounds nothing.
 PEAK = {"single": 2.0**100, "double": 2.0**930}
+
+
+SAMPLED_PATHS = 1000
+"""Trajectories from which the Newton matrix of the fit is estimated; its error only slows the fit."""
 
 
 class InfeasibleField(ValueError):
@@ -43,7 +50,7 @@ def _solve(problem: FieldProblem) -> TabField:
     if not tilt.needed:
         return TabField(problem, message(problem, tilt), tilt, None, 0.0, 1)
     history: History | None = None
-    if problem.rough is not None and not problem.options.timing_prior:
+    if problem.rough is not None and not problem.options.timing_prior and not tilt.scaling_is_exact:
         rough = Tilt.of(problem.rough)
         try:
             _, _, _, history, _ = _fitted(problem.rough, rough, None)
@@ -63,7 +70,22 @@ def _fitted(
         latest[:] = [message(problem, current)]
         return expected_transitions(latest[0], problem.automaton.rank)
 
-    return *fit(tilt, pass_both_ways, history), latest[0]
+    def sample_visits() -> Floats:
+        chain = latest[0]
+        ticks = int(problem.automaton.rank.max())
+        paths = sample_paths(chain, ProductBelief(chain), np.random.default_rng(0), SAMPLED_PATHS, ticks)
+        return visits_of(paths, problem, len(tilt.log_branch))
+
+    return *fit(tilt, pass_both_ways, sample_visits, history), latest[0]
+
+
+def visits_of(paths: Trajectories, problem: FieldProblem, branches: int) -> Floats:
+    """``[K, B]``: counted visits of sampled trajectories that begin at tick 0."""
+    automaton = problem.automaton
+    symbols = np.asarray(problem.labels)[paths.cells]
+    before = np.column_stack([np.full(len(paths), automaton.initial), paths.automaton_states[:, :-1]])
+    branch = automaton.branch[before, symbols]
+    return np.stack([(branch == b).sum(axis=1) for b in range(branches)], axis=1).astype(np.float64)
 
 
 def message(problem: FieldProblem, tilt: Tilt) -> ProductChain:
