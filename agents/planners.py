@@ -37,6 +37,7 @@ from tab_marl.planning.models.shortest_path import ShortestPath, ShortestPathOpt
 from tab_marl.planning.models.walker import MoveCounts, Walker
 from tab_marl.planning.pursuit import Decision, PursuitOptions, decide
 from tab_marl.planning.routes import RouteMap, RouteOptions
+from tab_marl.planning.scenarios import ReuseOptions, ScenarioSet
 from tab_marl.world.scenario import UnknownName
 
 PLANNERS = ("S-POMCP", "FP-POMCP", "MLE-POMCP", "TAB-POMCP", "oracle", "population-POMCP", "random")
@@ -52,6 +53,7 @@ class PlannerOptions:
     """How to plan. Nothing in here is a planner's own but its adversary model's options."""
 
     pursuit: PursuitOptions = field(default_factory=PursuitOptions)
+    reuse: ReuseOptions = field(default_factory=ReuseOptions)
     routes: RouteOptions = field(default_factory=RouteOptions)
     tab_field: FieldOptions = field(default_factory=FieldOptions)
     """Of TAB-POMCP and the oracle."""
@@ -113,6 +115,7 @@ class PlannerAgent:
         self.task, self.rng = task, rng
         self.routes = RouteMap.build(scenario, goal_places(task), self.options.routes)
         self._model = self._make_model(task, rng)
+        self._scenarios = ScenarioSet(scenario, self.options.pursuit.paths, self.options.reuse)
         self.decision, self.decision_seconds = None, []
         self._steps_per_tick = round(scenario.step_seconds * scenario.control_hertz)
         self._steps_per_decision = scenario.control_hertz // scenario.decision_hertz
@@ -177,6 +180,7 @@ class PlannerAgent:
         tick = self._step // self._steps_per_tick
         observation = TickObservation(tick, (view.x, view.y), sighting)
         (self._model.start if tick == 0 else self._model.observe)(observation, self.rng)
+        self._scenarios.advance(observation)
         self._latest = None
 
     def _decide(self, view: EgoView) -> None:
@@ -184,8 +188,9 @@ class PlannerAgent:
         scenario, pursuit = self.task.scenario, self.options.pursuit
         left = scenario.horizon_ticks - self._step // self._steps_per_tick
         ticks = max(2, min(round(pursuit.horizon_seconds / scenario.step_seconds), left))
-        sampled = self._model.sample(pursuit.paths, ticks, self.rng)
-        current = None if self.decision is None else self.decision.route
+        sampled = self._scenarios.draw(self._model, ticks, left, self.rng)
+        per_decision = self._steps_per_decision // self._steps_per_tick
+        current = None if self.decision is None else self.decision.itinerary.later(per_decision)
         self.decision = decide(self.routes, (view.x, view.y, view.theta), sampled, current, pursuit, self.rng)
 
 

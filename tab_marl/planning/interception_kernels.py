@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Compiled loops of interception: when two moving points first come within a radius, and what a route is then worth.
 
 Arrays and scalars only; nothing here validates or raises. Each has a slow twin in ``tests/planning``.
@@ -9,6 +10,8 @@ import math
 
 import numpy as np
 from numba import njit
+
+from tab_marl.planning.motion_kernels import shortcut
 
 NEVER = -1.0
 """No meeting."""
@@ -95,3 +98,42 @@ def route_returns(routes, effort, paths, completed, radius, reward_met, reward_t
                 if ends:
                     returns[w, k] += reward_completed
     return returns, met
+
+
+@njit(cache=True)
+def detour_returns(
+    routes, returns, met, paths, completed, switch, second, nearest, cell_metres, centres, aims, goals, waypoints,
+    turn_ticks, reach, radius, reward_met, reward_tick, reward_completed, values,
+):  # fmt: skip
+    """Fill `values` ``[F, N, E]``: mean return of "first leg f until tick n, then route e", its second leg's effort left
+    aside.
+
+    `routes` ``[F, T + 1, 2]``, `returns` and `met` ``[F, K]`` are those of the first legs as plain routes
+    (`route_returns`). The second leg is driven by `motion_kernels.shortcut`.
+    """
+    scenarios = paths.shape[0]
+    ticks = min(routes.shape[1], paths.shape[1]) - 1
+    closing = largest_step(paths) + reach + 1e-9
+    leg = np.empty((ticks + 1, 2))
+    for f in range(routes.shape[0]):
+        for n in range(switch.shape[0]):
+            start = min(switch[n], ticks)
+            for j in range(second.shape[0]):
+                e = second[j]
+                shortcut(
+                    nearest, cell_metres, centres, aims[e], goals[e], waypoints[e, 0], waypoints[e, 1],
+                    routes[f, start, 0], routes[f, start, 1], start, turn_ticks, reach, leg,
+                )  # fmt: skip
+                total = 0.0
+                for k in range(scenarios):
+                    ends = 0 <= completed[k] <= ticks
+                    last = completed[k] if ends else ticks
+                    if (0.0 <= met[f, k] <= start) or last <= start:
+                        total += returns[f, k]
+                        continue
+                    at = first_meeting(leg[start:], paths[k, start:], last - start, radius, closing)
+                    if at >= 0.0:
+                        total += reward_met + reward_tick * (start + at)
+                    else:
+                        total += reward_tick * last + (reward_completed if ends else 0.0)
+                values[f, n, j] = total / scenarios

@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Compiled loops of the ego's own motion: straightened shortest paths and the unicycle that follows them.
 
 Arrays and scalars only; nothing here validates or raises. Each has a slow twin in ``tests/planning``.
@@ -78,34 +79,58 @@ def drive(nearest, cell_metres, centres, aim, goal, goal_x, goal_y, x, y, theta,
 
 
 @njit(cache=True)
-def route_table(
+def itinerary_table(
     nearest, cell_metres, centres, aims, goals, waypoints, x, y, theta, max_speed, max_turn_rate,
-    seconds, steps_per_tick, positions, effort,
+    seconds, steps_per_tick, first, switch, second, positions, effort,
 ):  # fmt: skip
-    """Fill `positions` ``[W + 1, T + 1, 2]`` and `effort` ``[W + 1, T + 1]``: every route driven from one pose.
+    """Fill `positions` ``[I, T + 1, 2]`` and `effort` ``[I, T + 1]``: every itinerary driven from one pose.
 
-    `effort` is the sum of v^2 + w^2 over the ticks so far (mean over the control steps of a tick). The last row stays.
+    Itinerary i takes route ``first[i]`` until tick ``switch[i]``, then ``second[i]``; route W stays. `effort` is the sum of
+    v^2 + w^2 over the ticks so far (mean over the control steps of a tick).
     """
     routes, ticks = waypoints.shape[0], positions.shape[1] - 1
-    for t in range(ticks + 1):
-        positions[routes, t, 0], positions[routes, t, 1] = x, y
-        effort[routes, t] = 0.0
-    for i in range(routes):
+    for i in range(first.shape[0]):
         px, py, heading, spent = x, y, theta, 0.0
         positions[i, 0, 0], positions[i, 0, 1] = px, py
         effort[i, 0] = 0.0
-        arrived = False
+        arrived = -1
         for t in range(1, ticks + 1):
-            if not arrived:
+            route = first[i] if t <= switch[i] else second[i]
+            if route != arrived and route != routes:
                 for _ in range(steps_per_tick):
                     v, w = drive(
-                        nearest, cell_metres, centres, aims[i], goals[i], waypoints[i, 0], waypoints[i, 1],
-                        px, py, heading, max_speed, max_turn_rate, seconds,
+                        nearest, cell_metres, centres, aims[route], goals[route], waypoints[route, 0],
+                        waypoints[route, 1], px, py, heading, max_speed, max_turn_rate, seconds,
                     )  # fmt: skip
-                    arrived = v == 0.0 and w == 0.0
-                    if arrived:
+                    if v == 0.0 and w == 0.0:
+                        arrived = route
                         break
                     px, py, heading = unicycle_step(px, py, heading, v, w, seconds)
                     spent += (v * v + w * w) / steps_per_tick
             positions[i, t, 0], positions[i, t, 1] = px, py
             effort[i, t] = spent
+
+
+@njit(cache=True)
+def shortcut(nearest, cell_metres, centres, aim, goal, goal_x, goal_y, x, y, start, turn_ticks, reach, positions):
+    """Fill `positions` ``[T + 1, 2]`` from tick `start` on: along a route without turning circles, after a pause to turn.
+
+    `reach` is the distance driven in a tick. Quick, and within a tick or so of the true motion.
+    """
+    ticks = positions.shape[0] - 1
+    positions[start, 0], positions[start, 1] = x, y
+    for t in range(start + 1, ticks + 1):
+        left = reach if t > start + turn_ticks else 0.0
+        while left > 0.0:
+            r = min(max(int(y / cell_metres), 0), nearest.shape[0] - 1)
+            c = min(max(int(x / cell_metres), 0), nearest.shape[1] - 1)
+            target = aim[nearest[r, c]]
+            to_x, to_y = (goal_x, goal_y) if target == goal else (centres[target, 0], centres[target, 1])
+            gap = math.hypot(to_x - x, to_y - y)
+            if gap > left:
+                x, y = x + left / gap * (to_x - x), y + left / gap * (to_y - y)
+                left = 0.0
+            else:
+                x, y = to_x, to_y
+                left = 0.0 if target == goal or gap < 1e-9 else left - gap
+        positions[t, 0], positions[t, 1] = x, y

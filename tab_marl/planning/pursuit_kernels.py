@@ -1,4 +1,5 @@
-"""The pursuit as a generative model for POMCP: actions are routes of the ego, states are an adversary path and a pose.
+# mypy: ignore-errors
+"""The pursuit as a generative model for POMCP: actions are itineraries of the ego, states an adversary path and a pose.
 
 Arrays and scalars only; nothing here validates or raises. `data` is the tuple `pursuit.PursuitData`. A state is
 ``[path number, tick, x, y, theta]``.
@@ -62,12 +63,19 @@ def drive_tick(x, y, theta, route, geometry, robot):
 
 
 @njit(cache=True)
-def pursue(state, route, ticks, data):
-    """Drive a route for so many ticks, or until cameras begin or cease to see the adversary; moves `state` in place.
+def route_at(action, tick, itineraries):
+    """The route that an itinerary takes in the tick that begins at `tick`."""
+    first, switch, second = itineraries
+    return first[action] if tick < switch[action] else second[action]
+
+
+@njit(cache=True)
+def pursue(state, action, ticks, data):
+    """Follow an itinerary for so many ticks, or until cameras begin or cease to see the adversary; moves `state` in place.
 
     Returns (observation, reward, whether the scenario ended).
     """
-    paths, completed, cameras, geometry, robot, prices, _candidates, _open_loop, _baseline, search, _ways = data
+    paths, completed, cameras, geometry, robot, prices, itineraries, _open_loop, _baseline, search, _ways = data
     met, per_tick, per_effort, mission_completed = prices
     radius, square = search[0], search[1]
     k, t = int(state[0]), int(state[1])
@@ -78,6 +86,7 @@ def pursue(state, route, ticks, data):
     for _ in range(ticks):
         if over:
             break
+        route = route_at(action, t, itineraries)
         to_x, to_y, theta, spent, _still = drive_tick(x, y, theta, route, geometry, robot)
         s = meeting_fraction(
             x - paths[k, t, 0], y - paths[k, t, 1], to_x - paths[k, t + 1, 0], to_y - paths[k, t + 1, 1], radius
@@ -97,9 +106,9 @@ def pursue(state, route, ticks, data):
 
 
 @njit(cache=True)
-def wait_for(state, route, data):
-    """The return of driving a route to its end and waiting there, from a state on."""
-    paths, completed, _cameras, geometry, robot, prices, _candidates, _open_loop, _baseline, search, _ways = data
+def wait_for(state, action, data):
+    """The return of following an itinerary to its end and waiting there, from a state on."""
+    paths, completed, _cameras, geometry, robot, prices, itineraries, _open_loop, _baseline, search, _ways = data
     met, per_tick, per_effort, mission_completed = prices
     radius, closing = search[0], search[2]
     k, t = int(state[0]), int(state[1])
@@ -107,6 +116,7 @@ def wait_for(state, route, data):
     last, ends = last_tick(completed[k], paths.shape[1] - 1)
     reward = 0.0
     while t < last:
+        route = route_at(action, t, itineraries)
         to_x, to_y, theta, spent, still = drive_tick(x, y, theta, route, geometry, robot)
         s = meeting_fraction(
             x - paths[k, t, 0], y - paths[k, t, 1], to_x - paths[k, t + 1, 0], to_y - paths[k, t + 1, 1], radius
@@ -115,7 +125,7 @@ def wait_for(state, route, data):
             return reward + met + s * (per_tick + per_effort * spent)
         x, y, t = to_x, to_y, t + 1
         reward += per_tick + per_effort * spent
-        if still:
+        if still and route == itineraries[2][action]:
             break
     while t < last:
         ax, ay = x - paths[k, t, 0], y - paths[k, t, 1]
@@ -134,46 +144,43 @@ def wait_for(state, route, data):
 
 
 @njit(cache=True)
-def prospects(state, alike_metres, leave_out, data, values):
-    """Fill `values` ``[m]``: what driving each candidate route from here is worth against the paths that look alike now.
+def prospects(state, kept, alike_metres, leave_out, data, values):
+    """Fill `values` ``[m]``: what each itinerary is worth from here against the paths that look alike now.
 
-    A path looks alike if it is within `alike_metres` of the state's path at this tick, or if both are unseen. Meetings
-    count at the waypoint only: the ego arrives by the geodesic distance and a turn, and the path must still come by.
+    A path looks alike if it is within `alike_metres` of the state's path at this tick. Meetings count at the waypoint of
+    the leg in force only (the ego arrives by the geodesic distance and a turn, and the path must still come by), except for
+    the itinerary `kept` so far, whose return is known. So a change must beat what is certain by what is guaranteed.
     `leave_out` leaves the state's own path out, so that a choice made by these values is blind to it.
     Returns how many paths were alike; `values` is untouched if none was.
     """
-    paths, completed, cameras, geometry, robot, prices, candidates, _open_loop, _baseline, search, ways = data
+    paths, completed, _cameras, geometry, robot, prices, itineraries, open_loop, _baseline, _search, ways = data
     met, per_tick, _per_effort, mission_completed = prices
     distances, first_contact, last_contact = ways
     nearest, cell_metres = geometry[0], geometry[1]
     reach = robot[0] * robot[2] * robot[3]
     k, t = int(state[0]), int(state[1])
-    here_x, here_y = paths[k, t, 0], paths[k, t, 1]
-    visible = sight_code(here_x, here_y, cameras, search[1]) != UNSEEN
+    actions = values.shape[0]
     r = min(max(int(state[3] / cell_metres), 0), nearest.shape[0] - 1)
     c = min(max(int(state[2] / cell_metres), 0), nearest.shape[1] - 1)
     cell = nearest[r, c]
     alike = 0
     for j in range(paths.shape[0]):
-        if leave_out and j == k:
-            continue
         last, ends = last_tick(completed[j], paths.shape[1] - 1)
-        if last <= t:
-            continue
-        if visible:
-            dx, dy = paths[j, t, 0] - here_x, paths[j, t, 1] - here_y
-            if dx * dx + dy * dy > alike_metres * alike_metres:
-                continue
-        elif sight_code(paths[j, t, 0], paths[j, t, 1], cameras, search[1]) != UNSEEN:
+        dx, dy = paths[j, t, 0] - paths[k, t, 0], paths[j, t, 1] - paths[k, t, 1]
+        if (leave_out and j == k) or last <= t or dx * dx + dy * dy > alike_metres * alike_metres:
             continue
         if alike == 0:
             values[:] = 0.0
         alike += 1
-        for a in range(candidates.shape[0]):
-            route = candidates[a]
+        for a in range(actions):
+            if a == kept:
+                values[a] += open_loop[a, j] - per_tick * t
+                continue
+            route = route_at(a, t, itineraries)
+            row = a if t < itineraries[1][a] else actions + a
             travel = 0.0 if route == distances.shape[0] else distances[route, cell] / reach + TURN_TICKS
-            arrival = max(t + travel, first_contact[a, j])
-            if last_contact[a, j] >= arrival:
+            arrival = max(t + travel, first_contact[row, j])
+            if last_contact[row, j] >= arrival:
                 values[a] += met + per_tick * (arrival - t)
             else:
                 values[a] += per_tick * (last - t) + (mission_completed if ends else 0.0)
@@ -199,47 +206,59 @@ def contacts(paths, completed, points, radius, first, last):
                     last[a, k] = t
 
 
+@njit(cache=True)
+def answer(state, action, observation, data):
+    """The return of going on along an itinerary, and of taking the best-looking one whenever a camera sees the adversary.
+
+    The choice is made by the other paths that look alike, so it knows no more than the ego will.
+    """
+    search = data[9]
+    values = np.empty(data[8].shape[0])
+    chosen, total = action, 0.0
+    for _ in range(int(search[7])):
+        if observation != UNSEEN and prospects(state, chosen, search[6], True, data, values) > 0:
+            best = int(np.argmax(values))
+            if values[best] > values[chosen] + search[8]:
+                chosen = best
+        observation, reward, over = pursue(state, chosen, data[0].shape[1], data)
+        total += reward
+        if over:
+            return total
+    return total + wait_for(state, chosen, data)
+
+
 def step(state, action, data, _rng):
     """POMCP's generative step: one macro-action.
 
     The first one of a simulation is paid ``baseline[a] - open_loop[a, path]`` on top: a control variate, by which a
-    simulation that never changes its route returns exactly the route's mean over all paths, and the search only
-    measures what changing routes later is worth.
+    simulation that never changes its itinerary returns exactly the itinerary's mean over all paths, and the search only
+    measures what changing later is worth.
+
+    Unless the search is to branch on sightings, one ends the simulation, paid by `answer`: so few sampled paths agree on a
+    sighting that a branch below it would learn their futures by heart.
     """
-    candidates, open_loop, baseline, search = data[6], data[7], data[8], data[9]
+    open_loop, baseline, search = data[7], data[8], data[9]
     extra = 0.0
     if state[1] == 0.0:
         extra = baseline[action] - open_loop[action, int(state[0])]
-    observation, reward, over = pursue(state, candidates[action], int(search[3]), data)
+    observation, reward, over = pursue(state, action, int(search[3]), data)
+    if not over and observation != UNSEEN and search[9] == 0.0:
+        reward += answer(state, action, observation, data)
+        over = True
     return observation, reward + extra, over
 
 
 def rollout(state, action, observation, _depth, _max_depth, _discount, data, _rng):
-    """The leaf: go on along the last route; when a camera sees the adversary, take the route that then looks best.
-
-    The choice is made by the other paths that look alike, so it knows no more than the ego will.
-    """
-    candidates, search = data[6], data[9]
-    values = np.empty(candidates.shape[0])
-    route, total = action, 0.0
-    for _ in range(int(search[7])):
-        if observation != UNSEEN and prospects(state, search[6], True, data, values) > 0:
-            best = int(np.argmax(values))
-            if values[best] > values[route] + search[8]:
-                route = best
-        observation, reward, over = pursue(state, candidates[route], data[0].shape[1], data)
-        total += reward
-        if over:
-            return total
-    return total + wait_for(state, candidates[route], data)
+    """The leaf: `answer`."""
+    return answer(state, action, observation, data)
 
 
 def prior(state, action, observation, _depth, data, values, counts):
-    """At a node below the root: what the routes are worth against the paths that look alike; keeping on counts more."""
+    """At a node below the root: what the itineraries are worth against the paths that look alike (if any was seen)."""
     baseline, search, per_tick = data[8], data[9], data[5][1]
     alike = 0
     if observation != UNSEEN:
-        alike = prospects(state, search[6], True, data, values)
+        alike = prospects(state, action, search[6], True, data, values)
     if alike == 0:
         for a in range(values.shape[0]):
             values[a] = baseline[a] - per_tick * state[1]

@@ -36,13 +36,37 @@ class RouteOptions:
             raise ValueError(f"RouteOptions.clearance_metres is {self.clearance_metres}, must be >= 0")
 
 
+class Itinerary(NamedTuple):
+    """A route, and another one to change to at some tick; a plain route changes to itself."""
+
+    first: int
+    switch_tick: int
+    """Ticks from now; the first route is taken up to it."""
+    second: int
+
+    @classmethod
+    def plain(cls, route: int) -> Itinerary:
+        return cls(route, 0, route)
+
+    def later(self, ticks: int) -> Itinerary:
+        """The same plan when so many ticks have gone by."""
+        if self.switch_tick <= ticks:
+            return Itinerary.plain(self.second)
+        return Itinerary(self.first, self.switch_tick - ticks, self.second)
+
+    @property
+    def now(self) -> int:
+        """The route to drive next."""
+        return self.first if self.switch_tick > 0 else self.second
+
+
 class RouteTable(NamedTuple):
-    """Every route driven from one pose; the last row stays where the ego is."""
+    """Routes or itineraries driven from one pose."""
 
     positions: Floats
-    """``[W + 1, T + 1, 2]`` metres, tick 0 is now."""
+    """``[I, T + 1, 2]`` metres, tick 0 is now."""
     effort: Floats
-    """``[W + 1, T + 1]``: v^2 + w^2 summed over the ticks so far."""
+    """``[I, T + 1]``: v^2 + w^2 summed over the ticks so far."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,15 +116,22 @@ class RouteMap:
         return float(v), float(w)
 
     def table(self, pose: tuple[float, float, float], ticks: int) -> RouteTable:
-        """Drive every route from (x, y, theta) for so many ticks."""
+        """Drive every route from (x, y, theta) for so many ticks; the last row stays where the ego is."""
+        return self.itinerary_table(pose, ticks, [Itinerary.plain(route) for route in range(self.stay + 1)])
+
+    def itinerary_table(
+        self, pose: tuple[float, float, float], ticks: int, itineraries: Sequence[Itinerary]
+    ) -> RouteTable:
+        """Drive each of these itineraries from (x, y, theta) for so many ticks."""
         x, y, theta = pose
         robot = self.scenario.ego
-        positions = np.empty((self.stay + 1, ticks + 1, 2))
-        effort = np.empty((self.stay + 1, ticks + 1))
-        motion_kernels.route_table(
+        first, switch, second = np.array(itineraries, dtype=np.int64).T.copy()
+        positions = np.empty((len(first), ticks + 1, 2))
+        effort = np.empty((len(first), ticks + 1))
+        motion_kernels.itinerary_table(
             self.nearest, self.grid.cell_metres, self.grid.centres, self.aims, self.goals, self.waypoints,
             float(x), float(y), float(theta), robot.max_speed, robot.max_turn_rate,
-            1.0 / self.scenario.control_hertz, self.control_steps_per_tick, positions, effort,
+            1.0 / self.scenario.control_hertz, self.control_steps_per_tick, first, switch, second, positions, effort,
         )  # fmt: skip
         return RouteTable(positions, effort)
 
