@@ -48,7 +48,7 @@ def test_a_run_writes_settings_log_and_checkpoint_and_reports_progress(undisturb
     assert TrainingSettings.from_toml(folder / "settings.toml") == SMALL
     assert (folder / CHECKPOINT_FILE).stat().st_size > 1000
     assert list((folder / LOG_FOLDER).glob("events.out.tfevents.*"))
-    assert [s.phase for s in stands][0] == "tasks"
+    assert next(s.phase for s in stands) == "tasks"
     training = [s for s in stands if s.phase == "training"]
     assert [s.done for s in training] == [8 * 32 * (i + 1) for i in range(12)]
     assert all(s.total == SMALL.steps and s.steps_per_second > 0 and set(s.success) == {"M1"} for s in training)
@@ -138,7 +138,7 @@ def test_a_damaged_checkpoint_is_refused_in_one_line(undisturbed, tmp_path):
     folder, _, _ = undisturbed
     (tmp_path / "settings.toml").write_bytes((folder / "settings.toml").read_bytes())
     (tmp_path / CHECKPOINT_FILE).write_bytes((folder / CHECKPOINT_FILE).read_bytes()[:5000])
-    with pytest.raises(TrainingError, match="cannot read the checkpoint .*delete it") as caught:
+    with pytest.raises(TrainingError, match=r"cannot read the checkpoint .*delete it") as caught:
         train(SMALL, tmp_path)
     assert "\n" not in str(caught.value)
 
