@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Compiled loops of the adversary's side: labels of points, what a policy observes, and a step of the batched world.
 
 Arrays and scalars only; nothing here validates or raises. `bank` is `adversary_tables.Tables`: many tasks packed into

@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Compiled loops of the batched world: N robots, each on a task of a bank, one control step at a time.
 
 Arrays and scalars only; nothing here validates or raises.

@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Compiled ray casts against discs and edges. Arrays and scalars only; nothing here validates or raises."""
 
 from __future__ import annotations

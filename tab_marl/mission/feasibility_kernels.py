@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Compiled loop of the feasibility check: earliest arrivals on the grid from many cells with different head starts.
 
 Arrays and scalars only; nothing here validates or raises. Slow twin in ``tests/mission``.

@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Compiled loops of missions: one tick of the automaton, and its clocks unrolled.
 
 Arrays and scalars only; nothing here validates or raises. Slow twins: `MissionAutomaton.advance`, and the tests'.

@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Compiled loops of the route fields: Dijkstra on locations x cells, and the any-angle look-ahead along a route.
 
 Arrays and scalars only; nothing here validates or raises. Each has a slow twin in ``tests/mission``.
