@@ -117,7 +117,7 @@ def style_figures(bank: Bank, rollouts: Rollouts, again: Rollouts | None = None)
     `bank` says what was drawn (side, via points); the rollouts may be those of a control on its own bank of the same
     tasks in the same order. `again`: other draws on the same tasks, for the spread.
     """
-    done = np.flatnonzero(rollouts.completed)
+    done = np.flatnonzero(rollouts.completed).tolist()
     tasks = [bank.tasks[int(rollouts.task[i])] for i in range(len(rollouts.task))]
     figures = {
         "side taken as drawn": _mean([_side_match(tasks[i], _path(rollouts, i)) for i in done]),
@@ -130,14 +130,14 @@ def style_figures(bank: Bank, rollouts: Rollouts, again: Rollouts | None = None)
         "touches per episode": float(rollouts.touches.mean()),
     }
     if again is not None:
-        both = np.flatnonzero(rollouts.completed & again.completed)
+        both = np.flatnonzero(rollouts.completed & again.completed).tolist()
         figures["spread between episodes, metres"] = _mean([_spread(_path(rollouts, i), _path(again, i)) for i in both])
     return figures
 
 
 def other_places(bank: Bank, rollouts: Rollouts, reference: Rollouts) -> float:
     """Share of episodes whose visited places differ from the reference's on the same task, where they could differ."""
-    both = np.flatnonzero(rollouts.completed & reference.completed)
+    both = np.flatnonzero(rollouts.completed & reference.completed).tolist()
     open_choice = [
         i
         for i in both

@@ -108,7 +108,7 @@ class ZooPolicy:
 
     def act(self, observation: NDArray[np.float32], rng: np.random.Generator | None = None) -> NDArray[np.float32]:
         """Action ``[2]`` (or ``[N, 2]``) in [-1, 1] for an observation ``[D]`` (or ``[N, D]``); `rng` adds its noise."""
-        hidden = observation
+        hidden: NDArray[Any] = observation
         last = len(self.weights) - 1
         for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             hidden = hidden @ weight
@@ -163,7 +163,8 @@ def load_policy(path: Path | str) -> ZooPolicy:
 def _assemble(card: PolicyCard, tensors: Mapping[str, NDArray[Any]], folder: Path) -> ZooPolicy:
     if card.layers[0] != OBSERVED or card.layers[-1] != ACTIONS:
         raise PolicyError(f"{folder}: layers are {card.layers}, must begin with {OBSERVED} and end with {ACTIONS}")
-    weights, biases = [], []
+    weights: list[NDArray[np.float32]] = []
+    biases: list[NDArray[np.float32]] = []
     for i, (inputs, outputs) in enumerate(zip(card.layers, card.layers[1:], strict=False)):
         for name, shape in ((f"layers.{i}.weight", (inputs, outputs)), (f"layers.{i}.bias", (outputs,))):
             array = tensors.get(name)

@@ -132,8 +132,8 @@ class _Plain:
     @classmethod
     def of(cls, scenario: Scenario, automaton: MissionAutomaton, grid: GridMap) -> _Plain:
         zone_distance = np.full(grid.cells, np.inf)
-        for region, fails in zip(automaton.regions, zones(automaton).any(axis=0), strict=True):
-            if fails:
+        for region, fails in zip(automaton.regions, zones(automaton).T, strict=True):
+            if fails.any():
                 zone_distance = np.minimum(zone_distance, region.distance(grid.centres))
         clearance = clearance_cost(grid, zone_distance)
         windows = later_windows(automaton, round(scenario.horizon_seconds / automaton.tick_seconds))

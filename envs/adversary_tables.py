@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,7 +136,7 @@ class _Pool:
         return at
 
     def join(self, dtype: type, tail: tuple[int, ...]) -> NDArray[np.generic]:
-        flat = [np.asarray(chunk, dtype=dtype).reshape(-1, *tail) for chunk in self._chunks]
+        flat: list[NDArray[Any]] = [np.asarray(chunk, dtype=dtype).reshape(-1, *tail) for chunk in self._chunks]
         # One unused row keeps the offsets of empty parts valid.
         flat.append(np.zeros((1, *tail), dtype=dtype))
         return np.ascontiguousarray(np.concatenate(flat))
