@@ -14,7 +14,7 @@ from tab_marl.envs.batched import Bank, BatchedWorld
 from tab_marl.mission.tasks import Task
 
 NOT_COMPLETED = -1
-DRAWS = 10
+DRAWS = 8
 """Latents drawn per policy for `rollout_unopposed`; its rollouts share them in turn."""
 
 
@@ -40,8 +40,13 @@ class Rollouts:
     """Per episode the places of the counted visits, in order."""
 
 
-def run_bank(policy: AdversaryPolicy, bank: Bank, tasks: NDArray[np.int64], rng: np.random.Generator) -> Rollouts:
-    """One episode of the policy on each of these tasks of the bank, side by side, until all have ended."""
+def run_bank(
+    policy: AdversaryPolicy, bank: Bank, tasks: NDArray[np.int64], rng: np.random.Generator, with_places: bool = True
+) -> Rollouts:
+    """One episode of the policy on each of these tasks of the bank, side by side, until all have ended.
+
+    Without `with_places` the places visited are not recorded, which is quicker.
+    """
     n = len(tasks)
     scenarios = [task.scenario for task in bank.tasks]
     policy.reset(_as_task(bank.tasks[int(tasks[0])]), rng)
@@ -58,7 +63,7 @@ def run_bank(policy: AdversaryPolicy, bank: Bank, tasks: NDArray[np.int64], rng:
     for step in range(1, steps + 1):
         before = world.location.copy()
         world.step(policy.act(world.observation))
-        for i in np.flatnonzero(world.visited):
+        for i in np.flatnonzero(world.visited) if with_places else ():
             automaton = bank.tasks[int(tasks[i])].automaton
             branch = automaton.branch[before[i], int(automaton.masks(world.state[i, :2])[0])]
             places[i].append(automaton.branch_places[branch] if branch >= 0 else "")
@@ -101,7 +106,7 @@ def rollout_unopposed(
         task.scenario, task.mission, policy.style, rng, min(count, DRAWS) if policy.style.varies else 1
     )
     bank = Bank.of(built)
-    rollouts = run_bank(policy, bank, np.arange(count) % len(bank), rng)
+    rollouts = run_bank(policy, bank, np.arange(count) % len(bank), rng, with_places=False)
     per_tick = round(task.scenario.step_seconds * task.scenario.control_hertz)
     steps = np.minimum(np.arange(task.scenario.horizon_ticks + 1) * per_tick, rollouts.positions.shape[1] - 1)
     completed = np.where(rollouts.completed, -(-rollouts.end // per_tick), NOT_COMPLETED)

@@ -220,6 +220,37 @@ def test_following_the_direction_reaches_the_goal_on_a_short_way(lab):
         assert walked <= 1.02 * expected + 0.1
 
 
+def test_the_look_ahead_is_the_farthest_cell_of_the_route_in_free_sight(lab):
+    """Straight to it: only free squares, no zone, nothing visited before the end; and on the route's own cells."""
+    grid = GridMap.from_scenario(lab, 0.1)
+    zone = lab.region("central zone")
+    automaton = in_order([lab.region("Checkpoint A"), lab.region("Checkpoint C")], avoid=[zone])
+    route = solve_route(automaton, grid)
+    rng = np.random.default_rng(2)
+    reached_goal = farther = 0
+    for point in grid.centres[rng.choice(grid.cells, 150)] + rng.uniform(-0.04, 0.04, (150, 2)):
+        location = int(rng.integers(2))
+        if automaton.masks(point)[0]:
+            continue
+        (target,), (after,) = route.targets(location, point)
+        cells, locations = route.path(location, point)
+        changed = int(np.flatnonzero(locations != location)[0])
+        assert target in cells[1 : changed + 1]
+        assert after == locations[list(cells).index(target)]
+        line = point + np.linspace(0, 1, 400)[:, None] * (grid.centres[target] - point)
+        squares = grid.cell_at[(line[:, 1] / 0.1).astype(int), (line[:, 0] / 0.1).astype(int)]
+        if target != cells[1]:  # the first cell is headed for in any case
+            farther += 1
+            on_line = squares[np.linspace(0, 399, 1 + int(np.hypot(*(line[-1] - line[0])) / 0.05) + 1).astype(int)]
+            assert (on_line >= 0).all()
+            bits = automaton.masks(grid.centres[on_line])
+            assert not (bits & 4).any()
+            goal = bits >> location & 1
+            assert (np.diff(goal) >= 0).all(), "a goal is entered once, at the end"
+        reached_goal += after != location
+    assert farther > 60 and reached_goal > 5
+
+
 def test_costs_bend_the_route_but_lengths_stay_plain(lab):
     grid = GridMap.from_scenario(Scenario.preset("open"), 0.1)
     automaton = in_order([Disc(2.5, 1.5, 0.15)])
