@@ -59,8 +59,6 @@ def evaluate(
 
     Episodes are stored as they end: the same command continues an interrupted run.
     """
-    from rich.console import Console
-
     from tab_marl.evaluation.settings import build_settings
 
     settings = build_settings(
@@ -78,11 +76,12 @@ def evaluate(
             "replays": replays,
         },
     )
+    from tab_marl.evaluation.console import notes_console
     from tab_marl.evaluation.episode import play_job
     from tab_marl.evaluation.evaluate import play_missing, prepare
     from tab_marl.evaluation.store import Store
 
-    notes = Console(stderr=True)
+    notes = notes_console()
     experiment = prepare(settings)
     with Store.create(out) as store:
         play_missing(experiment, store, play_job, notes, f"tab-marl {shlex.join(sys.argv[1:])}")
@@ -98,12 +97,11 @@ def report(
     replays: Annotated[int | None, typer.Option(help="Animated replays; default: as evaluated.")] = None,
 ) -> None:
     """Print the tables of stored episodes again and rewrite their report."""
-    from rich.console import Console
-
+    from tab_marl.evaluation.console import notes_console
     from tab_marl.evaluation.present import present
     from tab_marl.evaluation.store import Store
 
-    notes = Console(stderr=True)
+    notes = notes_console()
     with Store.open(out) as store:
         known = [s for s in store.settings() if s.rows]
         if not known:
@@ -165,12 +163,11 @@ def train(
     ] = None,
 ) -> None:
     """Train an adversary policy; the same command continues an interrupted run."""
-    from rich.console import Console
-
+    from tab_marl.evaluation.console import notes_console
     from tab_marl.evaluation.single import train_policy
 
     _announce_first_use()
-    train_policy(style, config, {"steps": steps, "seed": seed, "name": name}, out, Console(stderr=True))
+    train_policy(style, config, {"steps": steps, "seed": seed, "name": name}, out, notes_console())
 
 
 zoo_app = typer.Typer(help="The trained adversaries that ship with the package.", no_args_is_help=True)

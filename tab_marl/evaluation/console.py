@@ -69,6 +69,12 @@ def difference(paired: Paired | None, scale: float) -> str:
     return f"{scale * d.value:+.0f} [{scale * d.low:+.0f}, {scale * d.high:+.0f}] p {stars(paired.p_value)}"
 
 
+def notes_console() -> Console:
+    """For progress and remarks, on stderr; sentences stay on one line where nobody watches."""
+    console = Console(stderr=True, highlight=False)
+    return console if console.is_terminal else Console(stderr=True, highlight=False, soft_wrap=True)
+
+
 MEASURED = ("", "planner", "n", "ATCR % [95 %]", "paper", "StI [95 %]", "paper")
 PAIRED = ("ATCR - TAB, points", "StI - TAB, steps")
 
