@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """The compiled POMCP search: one function, compiled once per type of model data and cached on disk.
 
 The model enters as first-class function types (numba passes a pointer with a known signature), never as a jitted function or
@@ -32,20 +33,22 @@ def select(nodes, edges, node, exploration, root_log, inverse_root, rng):
     `root_log` and `inverse_root` [M] hold sqrt(log n) and 1 / sqrt(n) for n < M: roots and logarithms of small counts would
     take a third of the search.
     """
-    first = nodes[node].first_edge
-    count = nodes[node].edge_count
-    total = nodes[node].visits
+    first = nodes[node]["first_edge"]
+    count = nodes[node]["edge_count"]
+    total = nodes[node]["visits"]
     known = len(inverse_root)
     factor = exploration * (root_log[total] if total < known else math.sqrt(math.log(total)))
     untried = 0
     best = first
     best_score = -math.inf
     for edge in range(first, first + count):
-        visits = edges[edge].visits
+        visits = edges[edge]["visits"]
         if visits == 0:
             untried += 1
         elif untried == 0:
-            score = edges[edge].value + factor * (inverse_root[visits] if visits < known else 1.0 / math.sqrt(visits))
+            score = edges[edge]["value"] + factor * (
+                inverse_root[visits] if visits < known else 1.0 / math.sqrt(visits)
+            )
             if score > best_score:
                 best_score = score
                 best = edge
@@ -53,7 +56,7 @@ def select(nodes, edges, node, exploration, root_log, inverse_root, rng):
         return best
     chosen = below(rng, untried)
     for edge in range(first, first + count):
-        if edges[edge].visits == 0:
+        if edges[edge]["visits"] == 0:
             if chosen == 0:
                 return edge
             chosen -= 1
@@ -69,9 +72,9 @@ def expand(
     edge = first
     if prior is None:
         for a in range(actions):
-            edges[edge].value = 0.0
-            edges[edge].visits = 0
-            edges[edge].child = NO_CHILD
+            edges[edge]["value"] = 0.0
+            edges[edge]["visits"] = 0
+            edges[edge]["child"] = NO_CHILD
             edge_actions[edge] = a
             edge += 1
     else:
@@ -80,23 +83,23 @@ def expand(
         prior(state, action, observation, depth, data, values, counts)
         for a in range(actions):
             if counts[a] >= 0:
-                edges[edge].value = values[a]
-                edges[edge].visits = counts[a]
-                edges[edge].child = NO_CHILD
+                edges[edge]["value"] = values[a]
+                edges[edge]["visits"] = counts[a]
+                edges[edge]["child"] = NO_CHILD
                 edge_actions[edge] = a
-                nodes[node].visits += counts[a]
+                nodes[node]["visits"] += counts[a]
                 edge += 1
-    nodes[node].first_edge = first
-    nodes[node].edge_count = edge - first
+    nodes[node]["first_edge"] = first
+    nodes[node]["edge_count"] = edge - first
     used[EDGES] = edge
 
 
 @njit(cache=True, nogil=True)
 def find_child(nodes, edges, edge, observation):
     """The node reached by this edge and observation, or NO_CHILD."""
-    child = edges[edge].child
-    while child >= 0 and nodes[child].observation != observation:
-        child = nodes[child].sibling
+    child = edges[edge]["child"]
+    while child >= 0 and nodes[child]["observation"] != observation:
+        child = nodes[child]["sibling"]
     return child
 
 
@@ -140,8 +143,8 @@ def search(
         last_action = np.int64(-1)
         observation = np.int64(0)
         while True:
-            nodes[node].visits += 1
-            if nodes[node].edge_count == 0:
+            nodes[node]["visits"] += 1
+            if nodes[node]["edge_count"] == 0:
                 # Every action is forbidden here (or the root has none): the leaf estimate stands for what follows.
                 leaf_needed = True
                 break
@@ -163,17 +166,17 @@ def search(
                 if room and depth <= tree_depth:
                     child = used[NODES]
                     used[NODES] += 1
-                    nodes[child].observation = observation
-                    nodes[child].sibling = edges[edge].child
-                    nodes[child].visits = 1
-                    nodes[child].first_edge = UNEXPANDED
-                    nodes[child].edge_count = 0
-                    edges[edge].child = child
+                    nodes[child]["observation"] = observation
+                    nodes[child]["sibling"] = edges[edge]["child"]
+                    nodes[child]["visits"] = 1
+                    nodes[child]["first_edge"] = UNEXPANDED
+                    nodes[child]["edge_count"] = 0
+                    edges[edge]["child"] = child
                 break
-            if nodes[child].first_edge == UNEXPANDED:
+            if nodes[child]["first_edge"] == UNEXPANDED:
                 # Edges are made at the second visit: most nodes are visited once, and memory is what large trees wait for.
                 if not room:
-                    nodes[child].visits += 1
+                    nodes[child]["visits"] += 1
                     break
                 expand(prior, data, state, action, observation, depth, actions, nodes, edges, edge_actions, used,
                        child, values, counts)  # fmt: skip
@@ -190,8 +193,8 @@ def search(
         for d in range(depth - 1, -1, -1):
             leaf = path_rewards[d] + discount * leaf
             edge = path_edges[d]
-            edges[edge].visits += 1
-            edges[edge].value += (leaf - edges[edge].value) / edges[edge].visits
+            edges[edge]["visits"] += 1
+            edges[edge]["value"] += (leaf - edges[edge]["value"]) / edges[edge]["visits"]
     return len(particles)
 
 
@@ -217,30 +220,30 @@ def copy_subtree(nodes, edges, edge_actions, root, keep, new_nodes, new_edges, n
     """
     queue[0] = root
     new_nodes[0] = nodes[root]
-    new_nodes[0].sibling = NO_SIBLING
+    new_nodes[0]["sibling"] = NO_SIBLING
     node_count = 1
     edge_count = 0
     done = 0
     while done < node_count:
         old = queue[done]
-        if nodes[old].first_edge != UNEXPANDED:
-            new_nodes[done].first_edge = edge_count
-            for edge in range(nodes[old].first_edge, nodes[old].first_edge + nodes[old].edge_count):
+        if nodes[old]["first_edge"] != UNEXPANDED:
+            new_nodes[done]["first_edge"] = edge_count
+            for edge in range(nodes[old]["first_edge"], nodes[old]["first_edge"] + nodes[old]["edge_count"]):
                 if done == 0 and not keep[edge_actions[edge]]:
                     continue
                 new_edges[edge_count] = edges[edge]
                 new_actions[edge_count] = edge_actions[edge]
-                child = edges[edge].child
+                child = edges[edge]["child"]
                 if child != NO_CHILD:
-                    new_edges[edge_count].child = node_count
+                    new_edges[edge_count]["child"] = node_count
                 while child != NO_CHILD:
                     queue[node_count] = child
                     new_nodes[node_count] = nodes[child]
-                    following = nodes[child].sibling
-                    new_nodes[node_count].sibling = node_count + 1 if following != NO_SIBLING else NO_SIBLING
+                    following = nodes[child]["sibling"]
+                    new_nodes[node_count]["sibling"] = node_count + 1 if following != NO_SIBLING else NO_SIBLING
                     node_count += 1
                     child = following
                 edge_count += 1
-            new_nodes[done].edge_count = edge_count - new_nodes[done].first_edge
+            new_nodes[done]["edge_count"] = edge_count - new_nodes[done]["first_edge"]
         done += 1
     return node_count, edge_count
