@@ -114,13 +114,13 @@ def curve_plot(curves: Mapping[str, NDArray[np.float64]], title: str) -> str:
     )
     ends = spread_labels({p: top + h * (1 - float(c[-1])) for p, c in curves.items()}, 13, top + 4, top + h)
     for planner, curve in curves.items():
-        x = left + w * np.linspace(0, 1, len(curve))
-        y = top + h * (1 - curve)
-        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
+        across = left + w * np.linspace(0, 1, len(curve))
+        down = top + h * (1 - curve)
+        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across, down, strict=True))
         parts.append(
             f'<g class="{css_name(planner)}"><title>{escape(planner)}: {100 * curve[-1]:.1f} % at the end</title>'
             f'<polyline class="curve" points="{points}"/>'
-            f'<path class="leader" d="M{left + w} {y[-1]:.1f}L{left + w + 10} {ends[planner]:.1f}"/>'
+            f'<path class="leader" d="M{left + w} {down[-1]:.1f}L{left + w + 10} {ends[planner]:.1f}"/>'
             f'<text class="name" x="{left + w + 13}" y="{ends[planner] + 4:.1f}">{escape(_short(planner))}</text></g>'
         )
     return "".join(parts) + "</svg>"

@@ -96,7 +96,7 @@ def settings_key(content: Mapping[str, Any]) -> str:
 
 
 PRESETS: dict[str, dict[str, Any]] = {
-    "demo": {"episodes": 2, "families": ("point", "ambiguous"), "replays": 2},
+    "demo": {"episodes": 3, "families": ("point", "ambiguous"), "replays": 3},
     "paper": {"episodes": 150},
 }
 """Sizes by name: `demo` ends in minutes on two cores; `paper` is the paper's table, three families instead of one."""

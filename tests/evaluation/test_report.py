@@ -9,12 +9,10 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from tab_marl.evaluation import charts, figures, replay, report, settings
+from tab_marl.evaluation import charts, figures, report, settings
 from tab_marl.evaluation.errors import UserError
 from tab_marl.evaluation.report import ReportData
 from tab_marl.evaluation.statistics import Interval
-from tab_marl.evaluation.units import Job, Unit
-from tab_marl.world.scenario import Scenario
 
 VOID = {"meta", "link", "input", "br", "img"}
 
@@ -53,42 +51,6 @@ def outline(page):
     found.close()
     assert found.stack == []
     return found
-
-
-def replays():
-    trace = replay.Trace(10)
-    trace.poses = [(0.5 + 0.01 * k, 1.0, 0.0, 2.0, 2.0 - 0.01 * k, 1.0, k > 5) for k in range(20)]
-    trace.beliefs = [(k, np.eye(30)) for k in range(0, 20, 5)]
-    trace.events = [(1.5, "intercepted")]
-    episodes = [
-        {
-            "planner": p,
-            "outcome": "met </script><script>alert(1)</script>",
-            "note": "",
-            "trace": replay.encode_trace(trace),
-        }
-        for p in ("S-POMCP", "TAB-POMCP")
-    ]
-    drawn = replay.encode_map(Scenario.preset("lab"))
-    return [{"title": "M1, point", "about": "about", "why": "why", "map": drawn, "episodes": episodes}]
-
-
-@pytest.fixture
-def data(synthetic):
-    chosen = settings.EvaluationSettings(missions=("M1", "M5"), families=("point", "ambiguous"), episodes=8)
-    rows, timings = [], {}
-    for mission in chosen.missions:
-        for family in chosen.families:
-            for seed in range(chosen.episodes):
-                job = Job(Unit(mission, family, seed), chosen.planners, 1, None, ("direct", "<b>late</b>"), "default")
-                for row, timing in synthetic.play(job):
-                    rows.append(row)
-                    timings[row.key] = timing
-    broken = synthetic.row("MLE-POMCP", 99, error="ValueError: <script>alert(2)</script>", intercepted=False)
-    rows.append(broken)
-    return ReportData(
-        rows, timings, {"seed": 1}, "abc123", replays(), {"map": "<svg></svg>", "map_text": "t"}, [], "1.0"
-    )
 
 
 def test_page_is_whole_and_loads_nothing(data):
