@@ -107,7 +107,7 @@ class PlannerAgent:
         self.full_observation = name == "oracle"
         self.decision_seconds: list[float] = []
         self.decision: Decision | None = None
-        self.moves = MoveCounts() if name == "MLE-POMCP" else None
+        self.moves = untrained() if name == "MLE-POMCP" else None
         self._model: AdversaryModel | None = None
 
     def reset(self, task: Task, rng: np.random.Generator) -> None:
@@ -152,7 +152,7 @@ class PlannerAgent:
 
     def restore(self, state: Mapping[str, Any] | None) -> None:
         if self.moves is not None:
-            self.moves = MoveCounts() if state is None else MoveCounts.from_json(state)
+            self.moves = untrained() if state is None else MoveCounts.from_json(state)
 
     def _make_model(self, task: Task, rng: np.random.Generator) -> AdversaryModel:
         scenario, mission, options = task.scenario, task.mission, self.options
@@ -192,6 +192,11 @@ class PlannerAgent:
         per_decision = self._steps_per_decision // self._steps_per_tick
         current = None if self.decision is None else self.decision.itinerary.later(per_decision)
         self.decision = decide(self.routes, (view.x, view.y, view.theta), sampled, current, pursuit, self.rng)
+
+
+def untrained() -> MoveCounts:
+    """What MLE-POMCP believes before it saw anything: half uniform moves, half along the mission's way."""
+    return MoveCounts(along_share=0.5)
 
 
 class RandomAgent:

@@ -7,7 +7,7 @@ two legs, a route and the tick at which to change to another one.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -18,6 +18,7 @@ from tab_marl.planning.interception import RouteValues, value_routes
 from tab_marl.planning.models.interface import SampledPaths
 from tab_marl.planning.pursuit_kernels import TURN_TICKS
 from tab_marl.planning.routes import Itinerary, RouteMap, RouteTable
+from tab_marl.world.scenario import Rewards
 
 Pose = tuple[float, float, float]
 
@@ -69,6 +70,8 @@ class PursuitOptions:
     """Sampled paths this near to a sighting tell what the sighting means."""
     switch_bonus: float = 2.0
     """By how much another route must look better before a rollout leaves its own."""
+    completion_weight: float = 1.0
+    """How many times its price a completed mission costs while planning; above 1 the ego gambles less on early meetings."""
     keep_bonus: float = 0.5
     """By how much another route must be better before the present one is left."""
     radius_share: float = 1.0
@@ -83,7 +86,7 @@ class PursuitOptions:
         for name in ("horizon_seconds", "macro_seconds", "square_metres", "radius_share", "alike_metres"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"PursuitOptions.{name} is {getattr(self, name)}, must be > 0")
-        for name in ("exploration", "keep_bonus", "keep_count", "detours", "detour_ends", "tree_seconds", "switches", "switch_bonus"):
+        for name in ("exploration", "keep_bonus", "completion_weight", "keep_count", "detours", "detour_ends", "tree_seconds", "switches", "switch_bonus"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"PursuitOptions.{name} is {getattr(self, name)}, must be >= 0")
 
@@ -123,7 +126,7 @@ def shortlist(
     radius = scenario.interception_metres * options.radius_share
 
     def value(table: RouteTable, paths: SampledPaths) -> RouteValues:
-        return value_routes(table, paths.positions, paths.completed_tick, scenario.rewards, radius)
+        return value_routes(table, paths.positions, paths.completed_tick, weighed(scenario.rewards, options), radius)
 
     table = routes.table(pose, ticks)
     rows = np.arange(routes.stay + 1)
@@ -146,6 +149,11 @@ def shortlist(
     chosen = covering(found.returns, found.mean + bonus, options.candidates, kept)
     values = RouteValues(found.returns[chosen], found.met[chosen])
     return Shortlist(tuple(itineraries[i] for i in chosen), values, bonus[chosen])
+
+
+def weighed(rewards: Rewards, options: PursuitOptions) -> Rewards:
+    """The rewards that are planned with."""
+    return replace(rewards, mission_completed=options.completion_weight * rewards.mission_completed)
 
 
 def first_paths(sampled: SampledPaths, count: int) -> SampledPaths:
@@ -196,7 +204,7 @@ def best_detours(
     hope = np.max([np.maximum(returns, returns[e]).mean(axis=1) for e in ends], axis=0)
     first = np.argsort(-hope, kind="stable")[: options.detours].astype(np.int64)
     found = np.empty((len(first), len(switch), len(ends)))
-    rewards = scenario.rewards
+    rewards = weighed(scenario.rewards, options)
     interception_kernels.detour_returns(
         table.positions[rows[first]], returns[first], met[first], few.positions, few.completed_tick, switch, rows[ends],
         *geometry_of(routes), TURN_TICKS, scenario.ego.max_speed * scenario.step_seconds,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tab_marl.planning import interception_kernels, pursuit_kernels
 from tab_marl.planning.interception import RouteValues
-from tab_marl.planning.itineraries import Geometry, Pose, PursuitOptions, geometry_of, shortlist
+from tab_marl.planning.itineraries import Geometry, Pose, PursuitOptions, geometry_of, shortlist, weighed
 from tab_marl.planning.model import CompiledModel
 from tab_marl.planning.models.interface import SampledPaths
 from tab_marl.planning.pomcp import Plan, Pomcp, PomcpOptions
@@ -93,6 +93,7 @@ def pursuit_model(
 ) -> CompiledModel:
     """The pursuit from a pose on, over these itineraries, worth `values` when followed without a change of mind."""
     scenario, step = routes.scenario, routes.scenario.step_seconds
+    rewards = weighed(scenario.rewards, options)
     paths = np.ascontiguousarray(sampled.positions, dtype=np.float64)
     closing = interception_kernels.largest_step(paths) + scenario.ego.max_speed * step + 1e-6
     radius = scenario.interception_metres * options.radius_share
@@ -111,8 +112,7 @@ def pursuit_model(
             float(routes.control_steps_per_tick),
         ),
         (
-            scenario.rewards.interception, scenario.rewards.per_step, scenario.rewards.control,
-            scenario.rewards.mission_completed,
+            rewards.interception, rewards.per_step, rewards.control, rewards.mission_completed,
         ),
         (first, switch, second),
         np.ascontiguousarray(values.returns),

@@ -38,12 +38,16 @@ GOAL_AWARE = tuple(name for name in PLANNERS if name not in ("S-POMCP", "random"
 
 
 def straight_lines(task: Task, rng: np.random.Generator):
-    """A population: straight to the goal, at various speeds."""
-    start = np.array(task.scenario.adversary_start.centre)
-    pace = rng.uniform(0.06, 0.11, (40, 1))
-    metres = np.minimum(pace * np.arange(task.scenario.horizon_ticks + 1), math.dist(start, GOAL))
-    positions = start + metres[:, :, None] * (np.array(GOAL) - start) / math.dist(start, GOAL)
-    return positions, np.argmax(metres >= math.dist(start, GOAL) - 0.18, axis=1).astype(np.int32)
+    """A population: to the goal over some point on the map, at various speeds."""
+    start, ticks = np.array(task.scenario.adversary_start.centre), task.scenario.horizon_ticks
+    paths, done = [], []
+    for _ in range(80):
+        corners = np.array([start, rng.uniform(0.2, 2.8, 2), GOAL])
+        at = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(corners, axis=0).T))])
+        metres = rng.uniform(0.08, 0.11) * np.arange(ticks + 1)
+        paths.append(np.stack([np.interp(metres, at, corners[:, axis]) for axis in (0, 1)], axis=1))
+        done.append(int(np.argmax(metres >= at[-1] - 0.18)) or -1)
+    return np.array(paths), np.array(done, dtype=np.int32)
 
 
 def play(agent, task: Task, seed: int, via: tuple[float, float] | None = None, seconds: float | None = None):

@@ -10,7 +10,7 @@ from tab_marl.planning import pursuit_kernels
 from tab_marl.planning.interception import value_routes
 from tab_marl.planning.models.interface import SampledPaths
 from tab_marl.planning.pursuit import PursuitOptions, decide, pursuit_model
-from tab_marl.planning.routes import RouteMap
+from tab_marl.planning.routes import Itinerary, RouteMap
 from tab_marl.world.regions import Disc
 from tab_marl.world.scenario import Checkpoint, Scenario
 
@@ -35,9 +35,8 @@ def test_without_route_changes_the_tree_gives_the_routes_values() -> None:
     options = PursuitOptions(tree_seconds=0.0, switches=0, simulations=2000, keep_bonus=0.0)
     decision = decide(MAP, POSE, sampled, None, options, RNG(0))
     assert decision.plan is not None
-    expected = decision.values.mean[decision.candidates]
-    assert decision.plan.values == pytest.approx(expected, abs=1e-4)
-    assert decision.route == decide(MAP, POSE, sampled, None, PursuitOptions(method="routes"), RNG(0)).route
+    assert decision.plan.values == pytest.approx(decision.values.mean, abs=1e-4)
+    assert decision.route == decide(MAP, POSE, sampled, None, PursuitOptions(method="routes", keep_bonus=0.0), RNG(0)).route
 
 
 @pytest.mark.parametrize("macro_seconds", [0.5, 1.0, 3.0])
@@ -45,8 +44,9 @@ def test_steps_and_rollout_add_up_to_the_open_loop_return(macro_seconds: float) 
     """Keeping one route, cut into macro-actions anywhere, is worth what the scan over whole routes says, path by path."""
     sampled = wandering(40, 40, seed=2)
     options = PursuitOptions(macro_seconds=macro_seconds, switches=0)
-    values = value_routes(MAP.table(POSE, 40), sampled.positions, sampled.completed_tick, LAB.rewards, 0.3)
-    candidates = np.array([0, 5, 17, 60, MAP.stay], dtype=np.int64)
+    candidates = [Itinerary.plain(w) for w in (0, 5, MAP.stay)] + [Itinerary(17, 9, 60), Itinerary(MAP.stay, 6, 3)]
+    table = MAP.itinerary_table(POSE, 40, candidates)
+    values = value_routes(table, sampled.positions, sampled.completed_tick, LAB.rewards, 0.3)
     model = pursuit_model(MAP, POSE, sampled, values, candidates, options)
     step, rollout = njit(pursuit_kernels.step), njit(pursuit_kernels.rollout)
     outcomes = {"met": 0, "not met": 0}
@@ -62,9 +62,9 @@ def test_steps_and_rollout_add_up_to_the_open_loop_return(macro_seconds: float) 
                         break
                 if not over:
                     total += rollout(state, a, 0, macros, 100, 1.0, model.data, np.zeros(1, dtype=np.uint64))
-                control = model.data.baseline[a] - values.returns[candidates[a], k] if macros else 0.0
-                assert total - control == pytest.approx(values.returns[candidates[a], k], abs=1e-3)
-            outcomes["met" if values.met[candidates[a], k] >= 0 else "not met"] += 1
+                control = model.data.baseline[a] - values.returns[a, k] if macros else 0.0
+                assert total - control == pytest.approx(values.returns[a, k], abs=1e-3)
+            outcomes["met" if values.met[a, k] >= 0 else "not met"] += 1
     assert min(outcomes.values()) > 20
 
 
@@ -72,8 +72,11 @@ def test_macro_actions_stop_when_a_camera_begins_to_see() -> None:
     camera = LAB.checkpoints[3]
     line = np.stack([np.linspace(camera.x - 1.2, camera.x, 21), np.full(21, camera.y)], axis=1)
     sampled = SampledPaths(line[None], np.array([-1], dtype=np.int32))
-    values = value_routes(MAP.table(POSE, 20), sampled.positions, sampled.completed_tick, LAB.rewards, 0.3)
-    model = pursuit_model(MAP, POSE, sampled, values, np.array([MAP.stay]), PursuitOptions(macro_seconds=30.0))
+    candidates = [Itinerary.plain(MAP.stay)]
+    table = MAP.itinerary_table(POSE, 20, candidates)
+    values = value_routes(table, sampled.positions, sampled.completed_tick, LAB.rewards, 0.3)
+    options = PursuitOptions(macro_seconds=30.0, branch_on_sightings=True)
+    model = pursuit_model(MAP, POSE, sampled, values, candidates, options)
     state = np.array([0.0, 0.0, *POSE])
     seen, _reward, over = njit(pursuit_kernels.step)(state, 0, model.data, np.zeros(1, dtype=np.uint64))
     entered = int(np.argmax(np.hypot(*(line - (camera.x, camera.y)).T) <= camera.camera_metres))
@@ -139,7 +142,7 @@ def test_more_simulations_do_not_make_the_fork_worse() -> None:
 def test_the_present_route_is_kept_unless_another_is_clearly_better() -> None:
     sampled = wandering(60, 40, seed=3)
     options = PursuitOptions(method="routes", keep_bonus=1000.0)
-    assert decide(MAP, POSE, sampled, 7, options, RNG(0)).route == 7
+    assert decide(MAP, POSE, sampled, Itinerary.plain(7), options, RNG(0)).route == 7
 
 
 @pytest.mark.parametrize("bad", [{"paths": 0}, {"macro_seconds": 0.0}, {"exploration": -1.0}, {"method": "magic"}])

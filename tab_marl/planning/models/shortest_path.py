@@ -1,9 +1,10 @@
 """FP-POMCP's adversary: it takes the shortest path to the mission's objectives at full speed.
 
 The definition is deterministic; what is seen may contradict it. So the belief is a set of hypotheses that all follow
-shortest paths and differ in the start, in a delay, in the pace, and in which of several goals is meant. The textbook
-hypothesis (no delay, full speed, nearest goals) has nearly all the weight until an observation speaks against it.
-Every sighting starts the paths anew from where the adversary was seen.
+shortest paths and differ in the start, in a delay (up to the last moment that lets the mission succeed), in the pace, in
+which of several goals is meant, and in a point passed before. The textbook hypothesis (no delay, full speed, nearest
+goals, nothing in between) has nearly all the weight until an observation speaks against it. Every sighting starts the
+paths anew from where the adversary was seen.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from tab_marl.world.grid import GridMap
 from tab_marl.world.regions import sample_in
 from tab_marl.world.scenario import Scenario
 
+NO_VIA = (math.nan, math.nan)
+
 
 @dataclass(frozen=True)
 class ShortestPathOptions:
@@ -30,10 +33,14 @@ class ShortestPathOptions:
 
     doubt: float = 0.05
     """Prior weight of all hypotheses but the textbook one."""
-    delays_seconds: tuple[float, ...] = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)
-    paces: tuple[float, ...] = (1.0, 0.7)
-    """Shares of full speed."""
-    starts: int = 8
+    delays_seconds: tuple[float, ...] = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+    """As far as the mission leaves so much time; the longest delay that it leaves is always added."""
+    paces: tuple[float, ...] = (0.7,)
+    """Shares of full speed other than 1."""
+    via_share: float = 0.25
+    """Share of the doubt that goes to hypotheses that pass some other point first."""
+    via_points: int = 12
+    starts: int = 4
     """Points of the start region, before the first sighting."""
     goal_variants: int = 8
     """At most so many other choices of goals."""
@@ -49,8 +56,8 @@ class ShortestPathOptions:
             raise ValueError(f"ShortestPathOptions.doubt is {self.doubt}, must lie strictly between 0 and 1")
         if not 0 < self.least_evidence < 1:
             raise ValueError(f"ShortestPathOptions.least_evidence is {self.least_evidence}, must lie in (0, 1)")
-        if 1.0 not in self.paces or 0.0 not in self.delays_seconds:
-            raise ValueError("ShortestPathOptions: paces must hold 1.0 and delays_seconds 0.0, the textbook hypothesis")
+        if not 0 <= self.via_share <= 1:
+            raise ValueError(f"ShortestPathOptions.via_share is {self.via_share}, must lie in 0..1")
 
 
 def goal_choices(mission: Mission, limit: int) -> tuple[Mission, ...]:
@@ -98,8 +105,6 @@ class _Hypotheses:
     base_tick: int
     choice: NDArray[np.int32]
     """``[H]`` which goals."""
-    prior: NDArray[np.float64]
-    """``[H]`` log."""
     positions: NDArray[np.float64]
     """``[H, T + 1, 2]``."""
     locations: NDArray[np.int32]
@@ -133,7 +138,7 @@ class ShortestPath:
         shares = np.full(count, self.options.doubt / max(1, count - 1))
         shares[0] = 1.0 if count == 1 else 1.0 - self.options.doubt
         before = [(m.automaton.initial, np.full(3, -1, dtype=np.int32)) for m in self.maps]
-        self._grow(starts, before, np.log(shares))
+        self._grow(starts, before, np.log(shares), rng)
         if seen is None:
             self._condition(observation)
 
@@ -153,7 +158,7 @@ class ShortestPath:
             before.append((int(paths.locations[best, then]), paths.clocks[best, then].copy()))
         shares -= np.logaddexp.reduce(shares)
         shares = np.maximum(shares, math.log(self.options.doubt / len(shares)))
-        self._grow(self._point(observation)[None], before, shares)
+        self._grow(self._point(observation)[None], before, shares, rng)
 
     def _index(self) -> int:
         """Column of the hypotheses that is now."""
@@ -170,36 +175,48 @@ class ShortestPath:
         starts: NDArray[np.float64],
         before: list[tuple[int, NDArray[np.int32]]],
         log_shares: NDArray[np.float64],
+        rng: np.random.Generator,
     ) -> None:
         """Follow every hypothesis to the episode's end; `before`: location and clocks by choice, one tick ago."""
-        options, scenario = self.options, self.scenario
-        ticks = max(1, scenario.horizon_ticks - self._tick)
-        kinds = [(d, p) for d in options.delays_seconds for p in options.paces if d == 0.0 or p == 1.0]
-        count = len(self.maps) * len(kinds) * len(starts)
-        choice = np.empty(count, dtype=np.int32)
-        prior = np.empty(count)
-        positions = np.empty((count, ticks + 1, 2))
-        locations = np.empty((count, ticks + 1), dtype=np.int32)
-        clocks = np.empty((count, ticks + 1, 3), dtype=np.int32)
-        completed = np.empty(count, dtype=np.int32)
-        h = 0
+        ticks = max(1, self.scenario.horizon_ticks - self._tick)
+        grown: list[tuple[int, float, NDArray[np.float64], NDArray[np.int32], NDArray[np.int32], int]] = []
         for c, m in enumerate(self.maps):
-            for delay, pace in kinds:
-                textbook = delay == 0.0 and pace == 1.0
-                share = 1.0 - options.doubt if textbook else options.doubt / (len(kinds) - 1)
-                for x, y in starts:
-                    location, state = before[c][0], before[c][1].copy()
-                    location = kernels.read_label(location, state, m.mask_at(x, y), m.rules)
-                    completed[h] = kernels.follow_way(
-                        x, y, location, state, round(delay / scenario.step_seconds), pace, m.reach_metres, m.rules,
-                        m.ways, m.ground, positions[h], locations[h], clocks[h],
+            for x, y in starts:
+                clocks = before[c][1].copy()
+                location = int(kernels.read_label(before[c][0], clocks, m.mask_at(x, y), m.rules))
+                kinds = self._kinds(m, (x, y), location, clocks, rng)
+                for share, delay, pace, via in kinds:
+                    positions = np.empty((ticks + 1, 2))
+                    locations, states = np.empty(ticks + 1, dtype=np.int32), np.empty((ticks + 1, 3), dtype=np.int32)
+                    done = kernels.follow_way(
+                        x, y, location, clocks, delay, pace, *via, m.reach_metres, m.rules, m.ways, m.ground, positions,
+                        locations, states,
                     )  # fmt: skip
-                    if location == -1:
-                        completed[h] = 0
-                    choice[h], prior[h] = c, log_shares[c] + math.log(share / len(starts))
-                    h += 1
-        self._paths = _Hypotheses(self._tick, choice, prior, positions, locations, clocks, completed)
-        self._log_weight = prior.copy()
+                    prior = log_shares[c] + math.log(share / len(starts))
+                    grown.append((c, prior, positions, locations, states, 0 if location == -1 else done))
+        choice, prior, positions, locations, states, completed = zip(*grown, strict=True)
+        self._paths = _Hypotheses(
+            self._tick, np.array(choice, dtype=np.int32), np.array(positions), np.array(locations), np.array(states),
+            np.array(completed, dtype=np.int32),
+        )  # fmt: skip
+        self._log_weight = np.array(prior)
+
+    def _kinds(
+        self, m: MissionMap, start: tuple[float, float], location: int, clocks: NDArray[np.int32], rng: np.random.Generator
+    ) -> list[tuple[float, int, float, tuple[float, float]]]:
+        """(prior share, delay in ticks, pace, via point or NO_VIA): the textbook hypothesis and those beside it."""
+        options, step = self.options, self.scenario.step_seconds
+        spare = kernels.spare_ticks(*start, location, clocks, m.rules, m.ways, m.mission_latest, m.reach_metres)
+        delays = [d for d in (round(s / step) for s in options.delays_seconds) if 0 < d < spare]
+        delays += [int(spare)] if spare > 0 else []
+        points = m.grid.centres[rng.integers(m.grid.cells, size=options.via_points)] if location >= 0 else ()
+        slow = [(0, pace, NO_VIA) for pace in options.paces] + [(d, 1.0, NO_VIA) for d in delays]
+        round_about = [(0, 1.0, (float(x), float(y))) for x, y in points]
+        via_share = options.via_share if round_about else 0.0
+        kinds = [(1.0 - options.doubt, 0, 1.0, NO_VIA)]
+        for group, share in ((slow, 1.0 - via_share), (round_about, via_share)):
+            kinds += [(options.doubt * share / len(group), *kind) for kind in group if share > 0]
+        return kinds
 
     def _condition(self, observation: TickObservation) -> None:
         here, least = self._paths.positions[:, self._index()], math.log(self.options.least_evidence)

@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Compiled loops of adversary models that move points: random walks along or across the way ahead, and the way itself.
 
 Arrays and scalars only; nothing here validates or raises. Each has a slow twin in ``tests/planning``. `rules`, `ways`
@@ -163,11 +164,32 @@ def too_early(location, clocks, mask, rules):
 
 
 @njit(cache=True)
-def follow_way(x, y, location, clocks, delay, pace, reach, rules, ways, ground, positions, locations, states):
+def spare_ticks(x, y, location, clocks, rules, ways, mission_latest, reach):
+    """How many ticks a robot may idle before its next visit, or its mission, is out of reach; 0 if none or hopeless."""
+    if location < 0:
+        return 0
+    _next, _forbidden, _progress, _patient, _earliest, latest, _resets = rules
+    nearest, cell_metres, _centres, _target, to_visit, length = ways
+    r, c = square_of(x, y, cell_metres, nearest.shape[0], nearest.shape[1])
+    cell = nearest[r, c]
+    if not np.isfinite(length[location, cell]):
+        return 0
+    spare = mission_latest - clocks[0] - math.ceil(length[location, cell] / reach)
+    for k in range(3):
+        if latest[location, k] < mission_latest:
+            spare = min(spare, latest[location, k] - clocks[k] - math.ceil(to_visit[location, cell] / reach))
+    return max(0, spare - 1)
+
+
+@njit(cache=True)
+def follow_way(
+    x, y, location, clocks, delay, pace, via_x, via_y, reach, rules, ways, ground, positions, locations, states
+):  # fmt: skip
     """Follow the way ahead for T ticks after waiting `delay` ticks; returns the tick of completion or -1.
 
-    Moves at `pace` times full speed, and stays outside while it would be too early. Fills `positions` ``[T + 1, 2]``,
-    `locations` ``[T + 1]`` and `states` ``[T + 1, 3]`` (clocks); the given location and clocks are those of tick 0.
+    Moves at `pace` times full speed, straight to the via point first (unless it is nan; obstacles are ignored there), and
+    stays outside while it would be too early. Fills `positions` ``[T + 1, 2]``, `locations` ``[T + 1]`` and `states`
+    ``[T + 1, 3]`` (clocks); the given location and clocks are those of tick 0.
     """
     ticks = positions.shape[0] - 1
     done = -1
@@ -175,12 +197,17 @@ def follow_way(x, y, location, clocks, delay, pace, reach, rules, ways, ground, 
     locations[0] = location
     states[0, :] = clocks
     moving = clocks.copy()
+    detour = not math.isnan(via_x)
     for t in range(1, ticks + 1):
         if location >= 0 and t > delay:
             left = reach * pace
             for _ in range(4):
-                ahead, gap = way_angle(x, y, location, ways)
-                if gap < 1e-9 or left < 1e-9:
+                if detour:
+                    ahead, gap = math.atan2(via_y - y, via_x - x), math.hypot(via_x - x, via_y - y)
+                    detour = gap > left
+                else:
+                    ahead, gap = way_angle(x, y, location, ways)
+                if left < 1e-9 or (gap < 1e-9 and not detour):
                     break
                 step = min(left, gap)
                 to_x, to_y = x + step * math.cos(ahead), y + step * math.sin(ahead)

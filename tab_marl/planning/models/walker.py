@@ -30,13 +30,16 @@ GONE_SHARE = 0.02
 class MoveCounts:
     """How often a move of each kind was seen: angle from the mission's way ahead x share of full speed.
 
-    Maximum likelihood of a distribution over bins is the share of each bin; `prior_moves` uniform moves are added, so
-    that what was not seen yet stays possible and an untrained model moves uniformly.
+    Maximum likelihood of a distribution over bins is the share of each bin. `prior_moves` moves are added before any was
+    seen: uniform ones, so that everything stays possible, and a share that the mission's constraints make likeliest,
+    straight along the way at full speed.
     """
 
     angles: int = 16
     speeds: int = 4
     prior_moves: float = 8.0
+    along_share: float = 0.0
+    """Of the prior moves."""
     counts: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     """``[angles, speeds]``."""
 
@@ -52,7 +55,9 @@ class MoveCounts:
         """``[angles * speeds]`` cumulative probabilities."""
         edges = np.arange(self.speeds + 1) / self.speeds
         uniform = np.tile(np.diff(edges**2) / self.angles, (self.angles, 1))
-        return np.cumsum((self.counts + self.prior_moves * uniform).ravel() / (self.counts.sum() + self.prior_moves))
+        prior = self.prior_moves * (1 - self.along_share) * uniform
+        prior[0, -1] += self.prior_moves * self.along_share
+        return np.cumsum((self.counts + prior).ravel() / (self.counts.sum() + self.prior_moves))
 
     def add(self, angle: float, speed_share: float, weight: float = 1.0) -> None:
         """Count a move at `angle` [rad] from the way ahead at this share of full speed."""
@@ -62,7 +67,7 @@ class MoveCounts:
 
     def to_json(self) -> dict[str, Any]:
         """Plain lists and numbers."""
-        return {"prior_moves": self.prior_moves, "counts": self.counts.tolist()}
+        return {"prior_moves": self.prior_moves, "along_share": self.along_share, "counts": self.counts.tolist()}
 
     @classmethod
     def from_json(cls, state: Mapping[str, Any]) -> MoveCounts:
@@ -70,7 +75,7 @@ class MoveCounts:
         counts = np.asarray(state["counts"], dtype=np.float64)
         if counts.ndim != 2:
             raise ValueError(f"MoveCounts state: counts has {counts.ndim} dimensions, must have 2 (angles, speeds)")
-        return cls(counts.shape[0], counts.shape[1], float(state["prior_moves"]), counts)
+        return cls(counts.shape[0], counts.shape[1], float(state["prior_moves"]), float(state["along_share"]), counts)
 
 
 class Walker:
