@@ -1,11 +1,14 @@
-"""Fitting the weights of the constraints: iterative proportional scaling, with Newton's step and Anderson's memory.
+"""Fitting the weights of the constraints, in rounds of one backward and one forward pass.
 
-Each round is one backward and one forward pass.
+A round ends with a step of the weights. Where trajectories visit one of several places and end, the step is iterative
+proportional scaling. Where they visit several, visits are correlated and scaling crawls or overshoots; then the step
+solves the same problem on the visits of sampled trajectories, reweighted, and is exact but for the sampling error.
+Late rounds are accelerated after Anderson (1965).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,25 +19,31 @@ Floats = NDArray[np.float64]
 
 MEMORY = 6
 """Changes remembered."""
-NEWTON_ROUNDS = 3
-"""Rounds in which the Newton matrix is sampled anew; later ones keep it, so that the memory stays consistent."""
+SAMPLED_ROUNDS = 5
+"""Rounds in which trajectories are sampled anew; later ones keep them, so that the memory stays consistent."""
+NEAR = 0.2
+"""Relative error below which steps are accelerated."""
+LONGEST_STEP = 3.0
+"""Of one logarithmic weight in one round: beyond it the sampled trajectories say little."""
 
 
 class History:
-    """What earlier rounds taught: how weights move the expected visits, and how the step changes with the weights."""
+    """What earlier rounds taught: visits of trajectories, and how the step changes with the weights."""
 
-    def __init__(self, newton: Floats | None = None) -> None:
-        self.newton = newton
-        """``[n, n]`` from log-ratios of visits to changes of the branches' weights; None: the ratios themselves."""
+    def __init__(self, visits: Floats | None = None, sizes: Sequence[int] = ()) -> None:
+        self.sizes = tuple(sizes)
+        """How many columns of `visits` belong to each set of alternatives."""
+        self.visits = visits
+        """``[K, n]`` visits of sampled trajectories at the constrained branches; None: plain scaling is exact."""
         self.moved: list[Floats] = []
         self.changed: list[Floats] = []
 
     def step(self, residual: Floats) -> Floats:
-        """Log-ratios -> a move of the weights: plain scaling, or Newton's step for the branches."""
-        if self.newton is None:
+        """Log-ratios target / present -> a move of the logarithmic weights."""
+        if self.visits is None:
             return residual
-        count = len(self.newton)
-        return np.concatenate([np.clip(self.newton @ residual[:count], -3.0, 3.0), residual[count:]])
+        count = self.visits.shape[1]
+        return np.concatenate([reweighting_step(self.visits, residual[:count], self.sizes), residual[count:]])
 
     def propose(self, step: Floats) -> Floats:
         """The next move: the step, corrected by least squares over the known changes (Anderson 1965)."""
@@ -43,7 +52,7 @@ class History:
         moved, changed = np.stack(self.moved, axis=1), np.stack(self.changed, axis=1)
         share = np.linalg.lstsq(changed, step, rcond=1e-10)[0]
         correction = (moved + changed) @ share
-        if not np.isfinite(correction).all() or np.abs(correction).max() > 4 * max(1.0, float(np.abs(step).max())):
+        if not np.isfinite(correction).all() or np.abs(correction).max() > 4 * float(np.abs(step).max()):
             return step
         return np.asarray(step - correction)
 
@@ -51,6 +60,48 @@ class History:
         self.moved.append(moved)
         self.changed.append(changed)
         del self.moved[:-MEMORY], self.changed[:-MEMORY]
+
+
+def reweighting_step(visits: Floats, residual: Floats, sizes: Sequence[int]) -> Floats:
+    """The change of log-weights that multiplies the mean of sampled visits ``[K, n]`` by ``exp(residual)``.
+
+    The columns come in sets of `sizes`; the total of each set stays. Newton's method on the convex dual of the sampled
+    problem, damped, and cut off at LONGEST_STEP.
+    """
+    present = visits.mean(axis=0)
+    wanted = present * np.exp(residual)
+    for part in np.split(np.arange(len(wanted)), np.cumsum(sizes)[:-1]):
+        wanted[part] *= present[part].sum() / wanted[part].sum()
+    move = np.zeros(len(residual))
+
+    def dual(at: Floats) -> tuple[float, Floats]:
+        exponent = visits @ at
+        top = float(exponent.max())
+        weight = np.exp(exponent - top)
+        return top + float(np.log(weight.sum())) - float(at @ wanted), weight / weight.sum()
+
+    value, law = dual(move)
+    for _ in range(30):
+        mean = law @ visits
+        gradient = mean - wanted
+        centred = visits - mean
+        curvature = (centred * law[:, None]).T @ centred
+        direction = -np.linalg.pinv(curvature, rcond=1e-6, hermitian=True) @ gradient
+        longest = float(np.abs(direction).max())
+        if longest < 1e-12:
+            break
+        scale = min(1.0, 1.0 / longest)
+        while scale > 1e-4:
+            following, candidate = dual(move + scale * direction)
+            if following <= value:
+                break
+            scale /= 2
+        else:
+            break
+        move, value, law = move + scale * direction, following, candidate
+        if np.abs(move).max() > LONGEST_STEP:
+            break
+    return np.asarray(np.clip(move, -LONGEST_STEP, LONGEST_STEP))
 
 
 def fit(
@@ -64,7 +115,7 @@ def fit(
     Args:
         pass_both_ways: the expected transitions ``[Q, L]`` under a tilt's weights.
         sample_visits: visits ``[K, B]`` of trajectories drawn under the latest weights.
-        history: of the fit of a similar problem; its Newton matrix is kept.
+        history: of the fit of a similar problem; its sampled visits are used.
     Returns:
         The last expected transitions, the largest relative error of a constrained expectation, the rounds taken, and
         what was learnt.
@@ -75,8 +126,9 @@ def fit(
     tilt.drop_infeasible(flux)
     if not np.array_equal(before, tilt.log_tick):
         flux = pass_both_ways(tilt)
-    kept = history is not None and history.newton is not None and len(history.newton) == tilt.branches
-    history = History(history.newton if history is not None and kept else None)
+    kept = history is not None and history.visits is not None and history.visits.shape[1] == tilt.branches
+    sizes = [len(group) for group in tilt.branch_groups]
+    history = History(history.visits if history is not None and kept else None, sizes)
     best, best_error = tilt.get(), np.inf
     residual = tilt.residual(flux)
     for rounds in range(1, options.max_iterations + 1):
@@ -85,11 +137,11 @@ def fit(
             best, best_error = tilt.get(), error
         if error <= options.marginal_tolerance or rounds == options.max_iterations:
             break
-        if not kept and rounds <= NEWTON_ROUNDS and tilt.branches:
-            history = History(newton_matrix(tilt, sample_visits()))
+        if tilt.branches and not (kept and rounds == 1) and rounds <= SAMPLED_ROUNDS:
+            history = History(correlated_visits(tilt, sample_visits()), sizes)
         here = tilt.get()
         step = history.step(residual)
-        tilt.put(here + history.propose(step))
+        tilt.put(here + (history.propose(step) if error < NEAR else step))
         flux = pass_both_ways(tilt)
         residual = tilt.residual(flux)
         history.learn(tilt.get() - here, history.step(residual) - step)
@@ -99,17 +151,9 @@ def fit(
     return flux, best_error, rounds, history
 
 
-def newton_matrix(tilt: Tilt, visits: Floats) -> Floats | None:
-    """Inverse Jacobian of the log-visits of the constrained branches, from the visits ``[K, B]`` of sampled trajectories.
-
-    d E[n_b] / d log w_c = Cov(n_b, n_c) in an exponential family. Where each trajectory visits exactly one of a single
-    set of alternatives, plain scaling is that step already, and None is returned.
-    """
+def correlated_visits(tilt: Tilt, visits: Floats) -> Floats | None:
+    """The columns of ``visits[K, B]`` that are constrained; None where each trajectory visits just one place."""
     used = visits[:, np.concatenate(tilt.branch_groups)]
     if len(tilt.branch_groups) == 1 and (used.sum(axis=1) == 1).all():
         return None
-    mean = used.mean(axis=0)
-    if (mean <= 0).any():
-        return None
-    covariance = (used - mean).T @ (used - mean) / len(used)
-    return np.asarray(np.linalg.pinv(covariance / mean[:, None], rcond=1e-3))
+    return None if (used.sum(axis=0) == 0).any() else used

@@ -23,8 +23,8 @@ Floats = NDArray[np.float64]
 PEAK = {"single": 2.0**100, "double": 2.0**930}
 
 
-SAMPLED_PATHS = 1000
-"""Trajectories from which the Newton matrix of the fit is estimated; its error only slows the fit."""
+SAMPLED_PATHS = 2000
+"""Trajectories that show how visits go together; their sampling error only slows the fit."""
 
 
 class InfeasibleField(ValueError):
