@@ -197,7 +197,8 @@ class FieldProblem:
                 break
             options = replace(options, headings=options.headings // 2)
         problem = cls._on_grid(compiled, grid, automaton, scenario, options, horizon)
-        if tumbling and entries * (options.headings + 1) > ROUGH_FROM and grid.cell_metres < ROUGH_CELL_METRES:
+        worth_it = entries * (options.headings + 1) > ROUGH_FROM and grid.cell_metres < ROUGH_CELL_METRES
+        if worth_it and tumbling and options.goal_marginals and len(compiled.branch_places) > 1:
             rough = GridMap.from_scenario(scenario, ROUGH_CELL_METRES)
             automaton = unroll(compiled, horizon, compiled.masks(rough.centres))
             coarse = replace(options, headings=8)
