@@ -30,6 +30,7 @@ from tab_marl.field.problem import FieldOptions
 from tab_marl.mission.propositions import region_of
 from tab_marl.mission.tasks import Task
 from tab_marl.planning.models.field_model import FieldModel
+from tab_marl.planning.models.guarded import EvidentModel, Guarded
 from tab_marl.planning.models.interface import AdversaryModel, Sighting, TickObservation
 from tab_marl.planning.models.mission_map import MissionMap
 from tab_marl.planning.models.pool import PoolOptions, TrajectoryPool
@@ -41,6 +42,8 @@ from tab_marl.planning.scenarios import ReuseOptions, ScenarioSet
 from tab_marl.world.scenario import UnknownName
 
 PLANNERS = ("S-POMCP", "FP-POMCP", "MLE-POMCP", "TAB-POMCP", "oracle", "population-POMCP", "random")
+
+GUARDS = tuple((name, 0.05) for name in ("FP-POMCP", "MLE-POMCP", "TAB-POMCP", "population-POMCP"))
 
 ROLLOUTS_PER_POLICY = 30
 
@@ -59,6 +62,8 @@ class PlannerOptions:
     """Of TAB-POMCP and the oracle."""
     shortest_path: ShortestPathOptions = field(default_factory=ShortestPathOptions)
     pool: PoolOptions = field(default_factory=PoolOptions)
+    guards: tuple[tuple[str, float], ...] = GUARDS
+    """(planner, prior of "it may be anywhere": `tab_marl.planning.models.guarded`); planners not named have no guard."""
     particles: int = 3000
     """Of S-POMCP and MLE-POMCP."""
     rollouts: Rollouts | None = None
@@ -114,7 +119,10 @@ class PlannerAgent:
         scenario = task.scenario
         self.task, self.rng = task, rng
         self.routes = RouteMap.build(scenario, goal_places(task), self.options.routes)
-        self._model = self._make_model(task, rng)
+        model = self._make_model(task, rng)
+        prior = dict(self.options.guards).get(self.name, 0.0)
+        guarded = prior > 0
+        self._model = Guarded(model, MissionMap.build(scenario, task.mission), prior) if guarded else model
         self._scenarios = ScenarioSet(scenario, self.options.pursuit.paths, self.options.reuse)
         self.decision, self.decision_seconds = None, []
         self._steps_per_tick = round(scenario.step_seconds * scenario.control_hertz)
@@ -154,7 +162,7 @@ class PlannerAgent:
         if self.moves is not None:
             self.moves = untrained() if state is None else MoveCounts.from_json(state)
 
-    def _make_model(self, task: Task, rng: np.random.Generator) -> AdversaryModel:
+    def _make_model(self, task: Task, rng: np.random.Generator) -> EvidentModel:
         scenario, mission, options = task.scenario, task.mission, self.options
         if self.name == "FP-POMCP":
             return ShortestPath(scenario, mission, options.shortest_path)

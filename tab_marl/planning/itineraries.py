@@ -70,7 +70,7 @@ class PursuitOptions:
     """Sampled paths this near to a sighting tell what the sighting means."""
     switch_bonus: float = 2.0
     """By how much another route must look better before a rollout leaves its own."""
-    completion_weight: float = 1.0
+    completion_weight: float = 3.0
     """How many times its price a completed mission costs while planning; above 1 the ego gambles less on early meetings."""
     keep_bonus: float = 0.5
     """By how much another route must be better before the present one is left."""
@@ -80,13 +80,32 @@ class PursuitOptions:
     def __post_init__(self) -> None:
         if self.method not in ("tree", "routes"):
             raise ValueError(f"PursuitOptions.method is {self.method!r}, must be 'tree' or 'routes'")
-        for name in ("paths", "candidates", "simulations", "root_count", "node_count", "detour_paths", "screened", "screening_paths"):
+        for name in (
+            "paths",
+            "candidates",
+            "simulations",
+            "root_count",
+            "node_count",
+            "detour_paths",
+            "screened",
+            "screening_paths",
+        ):
             if getattr(self, name) < 1:
                 raise ValueError(f"PursuitOptions.{name} is {getattr(self, name)}, must be >= 1")
         for name in ("horizon_seconds", "macro_seconds", "square_metres", "radius_share", "alike_metres"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"PursuitOptions.{name} is {getattr(self, name)}, must be > 0")
-        for name in ("exploration", "keep_bonus", "completion_weight", "keep_count", "detours", "detour_ends", "tree_seconds", "switches", "switch_bonus"):
+        for name in (
+            "exploration",
+            "keep_bonus",
+            "completion_weight",
+            "keep_count",
+            "detours",
+            "detour_ends",
+            "tree_seconds",
+            "switches",
+            "switch_bonus",
+        ):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"PursuitOptions.{name} is {getattr(self, name)}, must be >= 0")
 

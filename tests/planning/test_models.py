@@ -257,7 +257,7 @@ def test_follow_way_matches_a_slow_twin() -> None:
         positions, locations = np.empty((81, 2)), np.empty(81, dtype=np.int32)
         states = np.empty((81, 3), dtype=np.int32)
         done = kernels.follow_way(
-            1.4, 0.4, location, clocks, delay, pace, math.nan, math.nan, REACH, m.rules, m.ways, m.ground, positions, locations, states
+            1.4, 0.4, location, clocks, delay, pace, REACH, m.rules, m.ways, m.ground, positions, locations, states
         )
         state = m.automaton.first(int(m.automaton.masks((1.4, 0.4))[0]))
         x, y, expected = 1.4, 0.4, -1
@@ -300,7 +300,7 @@ def test_walkers_stay_on_free_ground() -> None:
     assert ground.free[rows, columns].all()
 
 
-@pytest.mark.parametrize("bad", [{"doubt": 0.0}, {"least_evidence": 1.0}, {"via_share": 2.0}])
+@pytest.mark.parametrize("bad", [{"doubt": 0.0}, {"least_evidence": 1.0}, {"paces": (1.0,)}])
 def test_bad_shortest_path_options_are_refused(bad: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="ShortestPathOptions"):
         ShortestPathOptions(**bad)  # type: ignore[arg-type]

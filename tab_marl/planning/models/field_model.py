@@ -49,13 +49,19 @@ class FieldModel:
         self.grid = grid
         self._cover = camera_cover(scenario, grid)
         self.belief = self.field.belief()
+        self._at_sighting = 0.0
 
     @property
     def fallbacks(self) -> int:
         return self.belief.fallbacks
 
+    @property
+    def log_evidence(self) -> float:
+        """Log-likelihood of the observations since the last sighting."""
+        return self.belief.log_evidence - self._at_sighting if np.isfinite(self.belief.log_evidence) else -50.0
+
     def start(self, observation: TickObservation, rng: np.random.Generator) -> None:
-        self.belief = self.field.belief()
+        self.belief, self._at_sighting = self.field.belief(), 0.0
         self._condition(observation)
 
     def observe(self, observation: TickObservation, rng: np.random.Generator) -> None:
@@ -86,3 +92,6 @@ class FieldModel:
             travelled = seen.speed * seen.age_seconds
             point = (seen.x + travelled * math.cos(seen.theta), seen.y + travelled * math.sin(seen.theta))
             self.belief.condition_on_seen(point, seen.theta, seen.speed / scenario.adversary.max_speed)
+            if not np.isfinite(self.belief.log_evidence):  # the filter fell back: it starts anew from here
+                self.belief.log_evidence = 0.0
+            self._at_sighting = self.belief.log_evidence

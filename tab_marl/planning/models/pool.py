@@ -53,6 +53,7 @@ class TrajectoryPool:
         self.positions = np.asarray(positions, dtype=np.float64)
         self.completed_tick = np.asarray(completed_tick, dtype=np.int32)
         self.fallbacks = 0
+        self.log_evidence = 0.0
         self._tick = 0
         self._log_weight = np.zeros(len(positions))
         self._seen: tuple[int, NDArray[np.float64]] | None = None
@@ -64,7 +65,7 @@ class TrajectoryPool:
         return np.asarray(weight / weight.sum())
 
     def start(self, observation: TickObservation, rng: np.random.Generator) -> None:
-        self.fallbacks, self._tick, self._seen = 0, 0, None
+        self.fallbacks, self._tick, self._seen, self.log_evidence = 0, 0, None, 0.0
         self._log_weight[:] = 0.0
         self._condition(observation)
 
@@ -85,10 +86,11 @@ class TrajectoryPool:
             point = np.array([seen.x + travelled * math.cos(seen.theta), seen.y + travelled * math.sin(seen.theta)])
             squared = ((here - point) ** 2).sum(axis=1)
             evidence = np.maximum(-squared / (2 * self.options.sight_metres**2), least)
-            self._seen = (self._tick, point)
+            self._seen, self.log_evidence = (self._tick, point), 0.0
         else:
             near = np.hypot(*(here - observation.ego).T) <= self.scenario.interception_metres
             evidence = np.where(self.scenario.seen(here) | near, least, 0.0)
+            self.log_evidence += math.log(float(self.weights @ np.exp(evidence)))
         self.fallbacks += bool(evidence.max() <= least)
         self._log_weight += evidence
 

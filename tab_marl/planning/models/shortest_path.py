@@ -1,10 +1,9 @@
 """FP-POMCP's adversary: it takes the shortest path to the mission's objectives at full speed.
 
 The definition is deterministic; what is seen may contradict it. So the belief is a set of hypotheses that all follow
-shortest paths and differ in the start, in a delay (up to the last moment that lets the mission succeed), in the pace, in
-which of several goals is meant, and in a point passed before. The textbook hypothesis (no delay, full speed, nearest
-goals, nothing in between) has nearly all the weight until an observation speaks against it. Every sighting starts the
-paths anew from where the adversary was seen.
+shortest paths and differ in the start, in a delay (up to the last moment that lets the mission succeed), in the pace, and in
+which of several goals is meant. The textbook hypothesis (no delay, full speed, nearest goals) has nearly all the weight
+until an observation speaks against it. Every sighting starts the paths anew from where the adversary was seen.
 """
 
 from __future__ import annotations
@@ -24,8 +23,6 @@ from tab_marl.world.grid import GridMap
 from tab_marl.world.regions import sample_in
 from tab_marl.world.scenario import Scenario
 
-NO_VIA = (math.nan, math.nan)
-
 
 @dataclass(frozen=True)
 class ShortestPathOptions:
@@ -37,9 +34,6 @@ class ShortestPathOptions:
     """As far as the mission leaves so much time; the longest delay that it leaves is always added."""
     paces: tuple[float, ...] = (0.7,)
     """Shares of full speed other than 1."""
-    via_share: float = 0.25
-    """Share of the doubt that goes to hypotheses that pass some other point first."""
-    via_points: int = 12
     starts: int = 4
     """Points of the start region, before the first sighting."""
     goal_variants: int = 8
@@ -56,8 +50,8 @@ class ShortestPathOptions:
             raise ValueError(f"ShortestPathOptions.doubt is {self.doubt}, must lie strictly between 0 and 1")
         if not 0 < self.least_evidence < 1:
             raise ValueError(f"ShortestPathOptions.least_evidence is {self.least_evidence}, must lie in (0, 1)")
-        if not 0 <= self.via_share <= 1:
-            raise ValueError(f"ShortestPathOptions.via_share is {self.via_share}, must lie in 0..1")
+        if not all(0 < pace < 1 for pace in self.paces):
+            raise ValueError(f"ShortestPathOptions.paces is {self.paces}, each must lie strictly between 0 and 1")
 
 
 def goal_choices(mission: Mission, limit: int) -> tuple[Mission, ...]:
@@ -123,12 +117,13 @@ class ShortestPath:
         self.scenario = scenario
         self.maps = _maps(scenario, mission, self.options.goal_variants)
         self.fallbacks = 0
+        self.log_evidence = 0.0
         self._tick = 0
         self._log_weight = np.empty(0)
         self._paths: _Hypotheses
 
     def start(self, observation: TickObservation, rng: np.random.Generator) -> None:
-        self.fallbacks, self._tick = 0, 0
+        self.fallbacks, self._tick, self.log_evidence = 0, 0, 0.0
         seen = observation.sighting
         if seen is None:
             starts = sample_in(self.scenario.adversary_start, rng, self.options.starts)
@@ -138,7 +133,7 @@ class ShortestPath:
         shares = np.full(count, self.options.doubt / max(1, count - 1))
         shares[0] = 1.0 if count == 1 else 1.0 - self.options.doubt
         before = [(m.automaton.initial, np.full(3, -1, dtype=np.int32)) for m in self.maps]
-        self._grow(starts, before, np.log(shares), rng)
+        self._grow(starts, before, np.log(shares))
         if seen is None:
             self._condition(observation)
 
@@ -148,6 +143,7 @@ class ShortestPath:
         seen = observation.sighting
         if seen is None:
             return
+        self.log_evidence = 0.0
         # Which goals, and how far the mission is, by the hypotheses near the sighting; the path itself starts anew.
         paths, then = self._paths, self._index() - 1
         shares, before = np.empty(len(self.maps)), []
@@ -158,7 +154,7 @@ class ShortestPath:
             before.append((int(paths.locations[best, then]), paths.clocks[best, then].copy()))
         shares -= np.logaddexp.reduce(shares)
         shares = np.maximum(shares, math.log(self.options.doubt / len(shares)))
-        self._grow(self._point(observation)[None], before, shares, rng)
+        self._grow(self._point(observation)[None], before, shares)
 
     def _index(self) -> int:
         """Column of the hypotheses that is now."""
@@ -175,7 +171,6 @@ class ShortestPath:
         starts: NDArray[np.float64],
         before: list[tuple[int, NDArray[np.int32]]],
         log_shares: NDArray[np.float64],
-        rng: np.random.Generator,
     ) -> None:
         """Follow every hypothesis to the episode's end; `before`: location and clocks by choice, one tick ago."""
         ticks = max(1, self.scenario.horizon_ticks - self._tick)
@@ -184,12 +179,12 @@ class ShortestPath:
             for x, y in starts:
                 clocks = before[c][1].copy()
                 location = int(kernels.read_label(before[c][0], clocks, m.mask_at(x, y), m.rules))
-                kinds = self._kinds(m, (x, y), location, clocks, rng)
-                for share, delay, pace, via in kinds:
+                kinds = self._kinds(m, (x, y), location, clocks)
+                for share, delay, pace in kinds:
                     positions = np.empty((ticks + 1, 2))
                     locations, states = np.empty(ticks + 1, dtype=np.int32), np.empty((ticks + 1, 3), dtype=np.int32)
                     done = kernels.follow_way(
-                        x, y, location, clocks, delay, pace, *via, m.reach_metres, m.rules, m.ways, m.ground, positions,
+                        x, y, location, clocks, delay, pace, m.reach_metres, m.rules, m.ways, m.ground, positions,
                         locations, states,
                     )  # fmt: skip
                     prior = log_shares[c] + math.log(share / len(starts))
@@ -202,21 +197,16 @@ class ShortestPath:
         self._log_weight = np.array(prior)
 
     def _kinds(
-        self, m: MissionMap, start: tuple[float, float], location: int, clocks: NDArray[np.int32], rng: np.random.Generator
-    ) -> list[tuple[float, int, float, tuple[float, float]]]:
-        """(prior share, delay in ticks, pace, via point or NO_VIA): the textbook hypothesis and those beside it."""
+        self, m: MissionMap, start: tuple[float, float], location: int, clocks: NDArray[np.int32]
+    ) -> list[tuple[float, int, float]]:
+        """(prior share, delay in ticks, pace): the textbook hypothesis and those beside it."""
         options, step = self.options, self.scenario.step_seconds
         spare = kernels.spare_ticks(*start, location, clocks, m.rules, m.ways, m.mission_latest, m.reach_metres)
         delays = [d for d in (round(s / step) for s in options.delays_seconds) if 0 < d < spare]
         delays += [int(spare)] if spare > 0 else []
-        points = m.grid.centres[rng.integers(m.grid.cells, size=options.via_points)] if location >= 0 else ()
-        slow = [(0, pace, NO_VIA) for pace in options.paces] + [(d, 1.0, NO_VIA) for d in delays]
-        round_about = [(0, 1.0, (float(x), float(y))) for x, y in points]
-        via_share = options.via_share if round_about else 0.0
-        kinds = [(1.0 - options.doubt, 0, 1.0, NO_VIA)]
-        for group, share in ((slow, 1.0 - via_share), (round_about, via_share)):
-            kinds += [(options.doubt * share / len(group), *kind) for kind in group if share > 0]
-        return kinds
+        slow = [(0, pace) for pace in options.paces] + [(delay, 1.0) for delay in delays]
+        doubt = options.doubt if slow else 0.0
+        return [(1.0 - doubt, 0, 1.0), *((doubt / len(slow), *kind) for kind in slow)]
 
     def _condition(self, observation: TickObservation) -> None:
         here, least = self._paths.positions[:, self._index()], math.log(self.options.least_evidence)
@@ -229,6 +219,7 @@ class ShortestPath:
             near = np.hypot(*(here - observation.ego).T) <= self.scenario.interception_metres
             contradicted = self.scenario.seen(here) | near
             evidence = np.where(contradicted, least, 0.0)
+            self.log_evidence += math.log(float(self._weights() @ np.exp(evidence)))
             surprise = contradicted.all()
         self.fallbacks += bool(surprise)
         self._log_weight = self._log_weight + evidence

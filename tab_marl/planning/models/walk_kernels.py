@@ -94,7 +94,9 @@ def way_angle(x, y, location, ways):
 
 
 @njit(cache=True)
-def walk_once(x, y, location, clocks, cumulative, speeds, feasible, mission_latest, reach, rules, ways, ground, trial, rng):
+def walk_once(
+    x, y, location, clocks, cumulative, speeds, feasible, mission_latest, reach, rules, ways, ground, trial, rng
+):
     """One random move of one walker; moves `clocks` in place and returns (x, y, location).
 
     `cumulative` ``[A * V]`` is the distribution over (angle from the way ahead, speed) bins, `speeds` the number V of
@@ -183,13 +185,12 @@ def spare_ticks(x, y, location, clocks, rules, ways, mission_latest, reach):
 
 @njit(cache=True)
 def follow_way(
-    x, y, location, clocks, delay, pace, via_x, via_y, reach, rules, ways, ground, positions, locations, states
+    x, y, location, clocks, delay, pace, reach, rules, ways, ground, positions, locations, states
 ):  # fmt: skip
     """Follow the way ahead for T ticks after waiting `delay` ticks; returns the tick of completion or -1.
 
-    Moves at `pace` times full speed, straight to the via point first (unless it is nan; obstacles are ignored there), and
-    stays outside while it would be too early. Fills `positions` ``[T + 1, 2]``, `locations` ``[T + 1]`` and `states`
-    ``[T + 1, 3]`` (clocks); the given location and clocks are those of tick 0.
+    Moves at `pace` times full speed, and stays outside while it would be too early. Fills `positions` ``[T + 1, 2]``,
+    `locations` ``[T + 1]`` and `states` ``[T + 1, 3]`` (clocks); the given location and clocks are those of tick 0.
     """
     ticks = positions.shape[0] - 1
     done = -1
@@ -197,17 +198,12 @@ def follow_way(
     locations[0] = location
     states[0, :] = clocks
     moving = clocks.copy()
-    detour = not math.isnan(via_x)
     for t in range(1, ticks + 1):
         if location >= 0 and t > delay:
             left = reach * pace
             for _ in range(4):
-                if detour:
-                    ahead, gap = math.atan2(via_y - y, via_x - x), math.hypot(via_x - x, via_y - y)
-                    detour = gap > left
-                else:
-                    ahead, gap = way_angle(x, y, location, ways)
-                if left < 1e-9 or (gap < 1e-9 and not detour):
+                ahead, gap = way_angle(x, y, location, ways)
+                if left < 1e-9 or gap < 1e-9:
                     break
                 step = min(left, gap)
                 to_x, to_y = x + step * math.cos(ahead), y + step * math.sin(ahead)

@@ -95,6 +95,7 @@ class Walker:
         self.moves = MoveCounts() if moves is None else moves
         self.feasible, self.learns, self.particles = feasible, learns, particles
         self.fallbacks = 0
+        self.log_evidence = 0.0
         self._cumulative = self.moves.cumulative()
         self._last: tuple[int, Sighting] | None = None
         self._xy = np.empty((0, 2))
@@ -103,7 +104,7 @@ class Walker:
 
     def start(self, observation: TickObservation, rng: np.random.Generator) -> None:
         scenario, n = self.map.scenario, self.particles
-        self.fallbacks, self._last = 0, None
+        self.fallbacks, self._last, self.log_evidence = 0, None, 0.0
         self._cumulative = self.moves.cumulative()
         self._xy = sample_in(scenario.adversary_start, rng, n)
         if observation.sighting is not None:
@@ -165,6 +166,7 @@ class Walker:
         gap = np.hypot(*(self._xy - observation.ego).T)
         possible = ~self.map.scenario.seen(self._xy) & (gap > self.map.scenario.interception_metres)
         weight = possible.astype(np.float64)
+        self.log_evidence += math.log(max(float(possible.mean()), GONE_SHARE))
         if possible.mean() < GONE_SHARE:
             self.fallbacks += 1
             weight += GONE_SHARE
@@ -179,6 +181,7 @@ class Walker:
         """Weight particles by how near they came, then put them where the adversary was seen and read the label there."""
         seen = observation.sighting
         assert seen is not None
+        self.log_evidence = 0.0
         travelled = seen.speed * seen.age_seconds
         point = np.array([seen.x + travelled * math.cos(seen.theta), seen.y + travelled * math.sin(seen.theta)])
         gap = np.hypot(*(self._xy - point).T)
