@@ -50,8 +50,9 @@ class SampledPaths(NamedTuple):
 class AdversaryModel(Protocol):
     """One belief about the adversary during one episode."""
 
-    fallbacks: int
-    """How often an observation contradicted everything the model held possible (it then recovered somehow)."""
+    @property
+    def fallbacks(self) -> int:
+        """How often an observation contradicted everything the model held possible (it then recovered somehow)."""
 
     def start(self, observation: TickObservation, rng: np.random.Generator) -> None:
         """Forget everything of earlier episodes but what was learned, and take the observation of tick 0."""

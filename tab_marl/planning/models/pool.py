@@ -114,4 +114,6 @@ class TrajectoryPool:
 
     def occupancy(self) -> tuple[GridMap, NDArray[np.float64]]:
         grid = GridMap.from_scenario(self.scenario, self.options.cell_metres)
-        return grid, np.bincount(grid.cells_of(self._now()), weights=self.weights, minlength=grid.cells)
+        return grid, np.asarray(
+            np.bincount(grid.cells_of(self._now()), weights=self.weights, minlength=grid.cells), dtype=np.float64
+        )

@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.mission.model import Constraint, Mission
+from tab_marl.mission.model import Constraint, Mission, Place
 from tab_marl.planning.models import walk_kernels as kernels
 from tab_marl.planning.models.interface import SampledPaths, TickObservation
 from tab_marl.planning.models.mission_map import MissionMap
@@ -71,7 +71,7 @@ def goal_choices(mission: Mission, limit: int) -> tuple[Mission, ...]:
     return tuple(found)
 
 
-def _narrow(goal: Constraint, place: object) -> Constraint | None:
+def _narrow(goal: Constraint, place: Place) -> Constraint | None:
     if goal.different == 1:
         return replace(goal, places=(place,), including=())
     if place in goal.including:
@@ -181,20 +181,21 @@ class ShortestPath:
                 location = int(kernels.read_label(before[c][0], clocks, m.mask_at(x, y), m.rules))
                 kinds = self._kinds(m, (x, y), location, clocks)
                 for share, delay, pace in kinds:
-                    positions = np.empty((ticks + 1, 2))
-                    locations, states = np.empty(ticks + 1, dtype=np.int32), np.empty((ticks + 1, 3), dtype=np.int32)
+                    track = np.empty((ticks + 1, 2))
+                    stages, states = np.empty(ticks + 1, dtype=np.int32), np.empty((ticks + 1, 3), dtype=np.int32)
                     done = kernels.follow_way(
-                        x, y, location, clocks, delay, pace, m.reach_metres, m.rules, m.ways, m.ground, positions,
-                        locations, states,
+                        x, y, location, clocks, delay, pace, m.reach_metres, m.rules, m.ways, m.ground, track, stages,
+                        states,
                     )  # fmt: skip
-                    prior = log_shares[c] + math.log(share / len(starts))
-                    grown.append((c, prior, positions, locations, states, 0 if location == -1 else done))
-        choice, prior, positions, locations, states, completed = zip(*grown, strict=True)
+                    prior = float(log_shares[c]) + math.log(share / len(starts))
+                    grown.append((c, prior, track, stages, states, 0 if location == -1 else done))
+        choice, priors, positions, locations, clock_rows, completed = zip(*grown, strict=True)
         self._paths = _Hypotheses(
-            self._tick, np.array(choice, dtype=np.int32), np.array(positions), np.array(locations), np.array(states),
+            self._tick, np.array(choice, dtype=np.int32), np.array(positions), np.array(locations),
+            np.array(clock_rows),
             np.array(completed, dtype=np.int32),
         )  # fmt: skip
-        self._log_weight = np.array(prior)
+        self._log_weight = np.array(priors)
 
     def _kinds(
         self, m: MissionMap, start: tuple[float, float], location: int, clocks: NDArray[np.int32]
@@ -246,4 +247,4 @@ class ShortestPath:
     def occupancy(self) -> tuple[GridMap, NDArray[np.float64]]:
         grid = self.maps[0].grid
         cells = grid.cells_of(self._paths.positions[:, self._index()])
-        return grid, np.bincount(cells, weights=self._weights(), minlength=grid.cells)
+        return grid, np.asarray(np.bincount(cells, weights=self._weights(), minlength=grid.cells), dtype=np.float64)
