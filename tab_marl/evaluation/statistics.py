@@ -42,7 +42,12 @@ class Paired:
 
     @property
     def verdict(self) -> int:
-        """-1 or 1 if the interval lies on one side of zero, else 0."""
+        """-1 or 1 if the interval lies on one side of zero and the test agrees (p < .05), else 0.
+
+        Both, because a bootstrap of few pairs is too narrow, and the test alone says nothing of the size.
+        """
+        if self.p_value >= 1 - CONFIDENCE:
+            return 0
         return int(self.difference.low > 0) - int(self.difference.high < 0)
 
 

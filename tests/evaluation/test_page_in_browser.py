@@ -54,7 +54,7 @@ def test_script_runs_and_draws(tmp_path, data, width):
     assert found == {
         "panels": 2,
         "colours": True,
-        "before": "0.7 s",  # opens a third into the episode of 1.9 s, so that there is something to see
+        "before": "1.3 s",  # opens at 70 % of the shorter episode, so that there is something to see
         "start": "0.0 s",
         "stepped": "0.5 s",
         "end": "1.9 s",

@@ -57,6 +57,12 @@ def test_paired_shares_is_mcnemar_on_the_pairs_that_differ():
     assert statistics.paired_shares(second, first).verdict == -1
 
 
+def test_four_pairs_are_no_verdict():
+    paired = statistics.paired_shares([1] * 4, [0] * 4)
+    assert paired.difference.low > 0 and paired.p_value == pytest.approx(0.125)
+    assert paired.verdict == 0
+
+
 def test_paired_shares_without_a_difference():
     same = statistics.paired_shares([1, 0, 1], [1, 0, 1])
     assert same.p_value == 1 and same.verdict == 0

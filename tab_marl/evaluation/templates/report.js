@@ -32,7 +32,8 @@
     }
     return out;
   }
-  const duration = () => Math.max(...groups[group].episodes.map(e => (e.trace.poses[0].length - 1) / e.trace.hertz));
+  const lengths = () => groups[group].episodes.map(e => (e.trace.poses[0].length - 1) / e.trace.hertz);
+  const duration = () => Math.max(...lengths());
 
   function choose(index) {
     group = index;
@@ -54,7 +55,7 @@
       return { episode, canvas, state, frames: new Map() };
     });
     scrub.max = Math.round(duration() * 10);
-    seek(duration() * 0.35);
+    seek(Math.min(...lengths()) * 0.7);  // every planner is still under way, with something to see
   }
 
   function seek(seconds) {
