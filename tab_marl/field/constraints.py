@@ -74,7 +74,7 @@ class Tilt:
         ticks = int(completion.max(initial=-1)) + 1
         return cls(
             problem,
-            alternatives(problem) if options.goal_marginals else [],
+            _within_reach(problem, alternatives(problem)) if options.goal_marginals else [],
             completion,
             np.zeros(int(automaton.branch.max(initial=-1)) + 1),
             np.zeros(ticks),
@@ -227,3 +227,28 @@ def alternatives(problem: FieldProblem) -> list[NDArray[np.int64]]:
     roots = np.array([root(b) for b in range(len(parent))], dtype=np.int64)
     groups = [np.flatnonzero(roots == r) for r in np.unique(roots)]
     return [group for group in groups if len(group) > 1]
+
+
+def _within_reach(problem: FieldProblem, groups: list[NDArray[np.int64]]) -> list[NDArray[np.int64]]:
+    """Leave out places farther from every start than full speed covers until they may last be visited.
+
+    Rounding to cells lets the reference be faster than the robot with a small probability; equal mass would make it large.
+    """
+    grid, scenario = problem.grid, problem.scenario
+    if grid is None or scenario is None or not groups:
+        return groups
+    automaton, labels = problem.automaton, np.asarray(problem.labels)
+    started = np.asarray(problem.start) > 0
+    tick_metres = scenario.adversary.max_speed * scenario.step_seconds
+    kept = []
+    for group in groups:
+        reachable = []
+        for b in group:
+            states, symbols = np.nonzero(automaton.branch == b)
+            goal = np.flatnonzero(np.isin(labels, symbols))
+            latest = int(automaton.rank[states].max(initial=0))
+            metres = float(grid.distances(goal)[started].min()) if len(goal) else np.inf
+            reachable.append(metres <= latest * tick_metres + grid.cell_metres)
+        if sum(reachable) > 1:
+            kept.append(group[reachable])
+    return kept

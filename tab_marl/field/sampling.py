@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.field import kernels
+from tab_marl.field import sampling_kernels as kernels
 from tab_marl.field.chain import ProductChain
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tab_marl.field import from_matrices, kernels, product_chain
+from tab_marl.field import from_matrices, kernels, product_chain, sampling_kernels
 from tab_marl.field.belief import ProductBelief
 
 
@@ -67,7 +67,7 @@ def test_normalisers_push_and_steps(modes, width):
         if q < 3:
             draws = 4000
             for s in rng.choice(np.flatnonzero(norm > 0), 3):
-                found = np.array([kernels.bridge_step(chain, q, s, (i + 0.5) / draws) for i in range(draws)])
+                found = np.array([sampling_kernels.bridge_step(chain, q, s, (i + 0.5) / draws) for i in range(draws)])
                 share = np.bincount(found, minlength=chain.states) / draws
                 np.testing.assert_allclose(share, law[s], atol=1.01 / draws * modes * width)
 
@@ -116,7 +116,7 @@ def test_plain_steps_follow_the_renormalised_reference():
     law, _ = dense_kernel(motion, chain, chain.accepting)
     streams = np.array([12345], dtype=np.uint64)
     draws = 20_000
-    found = [kernels.reference_step(motion.motion, 1, chain.states, 4, streams, 0) for _ in range(draws)]
+    found = [sampling_kernels.reference_step(motion.motion, 1, chain.states, 4, streams, 0) for _ in range(draws)]
     np.testing.assert_allclose(
         np.bincount(found, minlength=chain.states) / draws, law[4], atol=5 * np.sqrt(0.25 / draws)
     )
@@ -127,14 +127,14 @@ def test_uniform_stream_is_splitmix64():
     streams = np.zeros(1, dtype=np.uint64)
     known = [0xE220A8397B1DCDAF, 0x6E789E6AA1B965F4, 0x06C45D188009454F]
     for word in known:
-        assert kernels.next_uniform(streams, 0) == (word >> 11) / 2**53
+        assert sampling_kernels.next_uniform(streams, 0) == (word >> 11) / 2**53
 
 
 def test_draw_states_takes_evenly_spaced_points_of_the_mass():
     rng = np.random.default_rng(4)
     masses = rng.random((3, 7)) * (rng.random((3, 7)) < 0.5)
     slots, states = np.empty(100, dtype=np.int64), np.empty(100, dtype=np.int64)
-    kernels.draw_states(masses, masses.sum(), 100, 0.3, slots, states)
+    sampling_kernels.draw_states(masses, masses.sum(), 100, 0.3, slots, states)
     points = (np.arange(100) + 0.3) / 100 * masses.sum()
     flat = np.searchsorted(np.cumsum(masses), points, side="right")
     np.testing.assert_array_equal(slots * 7 + states, flat)

@@ -55,6 +55,16 @@ def test_goal_marginals_make_the_far_goal_as_likely_as_the_near():
     np.testing.assert_allclose(list(shares[True].values()), 0.25, rtol=0.05)
 
 
+def test_goals_out_of_reach_get_no_equal_share():
+    """Within 7 s, C and D can be reached; A and B only by a walker that cell rounding lets run."""
+    seconds = {place: shortest_seconds(LAB, place) for place in PLACES[:4]}
+    assert max(seconds["Checkpoint C"], seconds["Checkpoint D"]) < 6.0 and seconds["Checkpoint A"] > 8.5
+    mission = Mission((Constraint("deadline", PLACES[:4], seconds=7),))
+    shares = solve(FieldProblem.from_mission(mission, LAB, FieldOptions(cell_metres=0.1))).branch_shares
+    assert 0 < shares["Checkpoint A"] < 1e-4
+    np.testing.assert_allclose([shares["Checkpoint C"], shares["Checkpoint D"]], 0.5, rtol=0.05)
+
+
 def test_cells_grow_with_the_automaton():
     fine = FieldProblem.from_mission(reach("Checkpoint A", 20), LAB)
     assert fine.grid.cell_metres == 0.05 and fine.reference.modes == 17 and fine.rough is None
