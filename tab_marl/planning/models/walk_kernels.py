@@ -59,6 +59,27 @@ def read_label(location, clocks, mask, rules):
 
 
 @njit(cache=True)
+def read_labels(x, y, location, clocks, rules, ground):
+    """One tick of the automaton for N points; moves `location` ``[N]`` and `clocks` ``[N, 3]`` in place."""
+    for i in range(x.shape[0]):
+        location[i] = read_label(location[i], clocks[i], mask_of(x[i], y[i], ground), rules)
+
+
+@njit(cache=True)
+def wander(positions, start, reach, ground, rng):
+    """From tick `start` on, uniform random moves in place of what `positions` ``[T + 1, 2]`` held."""
+    for t in range(start + 1, positions.shape[0]):
+        x, y = positions[t - 1, 0], positions[t - 1, 1]
+        positions[t, 0], positions[t, 1] = x, y
+        for _ in range(DRAWS):
+            angle, distance = 2.0 * math.pi * rng.random(), reach * math.sqrt(rng.random())
+            to_x, to_y = x + distance * math.cos(angle), y + distance * math.sin(angle)
+            if can_move(x, y, to_x, to_y, ground):
+                positions[t, 0], positions[t, 1] = to_x, to_y
+                break
+
+
+@njit(cache=True)
 def in_time(x, y, location, clocks, rules, ways, mission_latest, reach):
     """Whether the next visit and the whole mission can still be reached in the time left, clocks and metres only."""
     if location < 0:

@@ -157,9 +157,8 @@ class Walker:
         return positions, completed
 
     def _read_labels(self) -> None:
-        for i, (x, y) in enumerate(self._xy):
-            mask = self.map.mask_at(x, y)
-            self._location[i] = kernels.read_label(int(self._location[i]), self._clocks[i], mask, self.map.rules)
+        x, y = np.ascontiguousarray(self._xy.T)
+        kernels.read_labels(x, y, self._location, self._clocks, self.map.rules, self.map.ground)
 
     def _forget_contradicted(self, observation: TickObservation, rng: np.random.Generator) -> None:
         """Drop particles in a camera disc (it would have been seen) or within reach of the ego (it would be over)."""
