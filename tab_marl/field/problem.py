@@ -41,7 +41,7 @@ class FieldOptions:
     """None: the finest of CELL_SIZES_METRES within `state_budget`."""
     headings: int = 16
     """Directions of run-and-tumble; halved when even the coarsest cells exceed the budget."""
-    mean_run_metres: float = 0.5
+    mean_run_metres: float = 1.0
     goal_marginals: bool = True
     """Where several places can serve, each is visited equally often."""
     timing_prior: bool = False
