@@ -87,7 +87,7 @@ class _Search:
         )
         seconds[:, MISSION_CLOCK] = np.minimum(seconds[:, MISSION_CLOCK], scenario.horizon_seconds)
         self.latest = seconds
-        self.earliest: Floats = automaton.earliest * self.tick
+        self.earliest: Floats = np.asarray(automaton.earliest * self.tick, dtype=np.float64)
         # [U, 3, S]: least value of each clock, in seconds, when a location is entered at a cell; inf: cannot be.
         self.entry = np.full((automaton.locations, 3, grid.cells), np.inf)
         self.completed = np.inf

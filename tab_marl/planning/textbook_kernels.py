@@ -82,7 +82,9 @@ def uniform_rollout(state, action, observation, depth, max_depth, discount, data
         random = np.uint64(mixed(word))
         action = _low(random, 5)
         tags = action == TAG
-        if tags & (robot == target):  # one seldom-taken branch: a fifth of all actions are tags, which no processor foresees
+        if tags & (
+            robot == target
+        ):  # one seldom-taken branch: a fifth of all actions are tags, which no processor foresees
             total += weight * 10.0
             break
         total -= weight * (10.0 if tags else 1.0)

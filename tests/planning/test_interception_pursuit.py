@@ -36,14 +36,17 @@ def test_without_route_changes_the_tree_gives_the_routes_values() -> None:
     decision = decide(MAP, POSE, sampled, None, options, RNG(0))
     assert decision.plan is not None
     assert decision.plan.values == pytest.approx(decision.values.mean, abs=1e-4)
-    assert decision.route == decide(MAP, POSE, sampled, None, PursuitOptions(method="routes", keep_bonus=0.0), RNG(0)).route
+    assert (
+        decision.route
+        == decide(MAP, POSE, sampled, None, PursuitOptions(method="routes", keep_bonus=0.0), RNG(0)).route
+    )
 
 
 @pytest.mark.parametrize("macro_seconds", [0.5, 1.0, 3.0])
 def test_steps_and_rollout_add_up_to_the_open_loop_return(macro_seconds: float) -> None:
     """Keeping one route, cut into macro-actions anywhere, is worth what the scan over whole routes says, path by path."""
     sampled = wandering(40, 40, seed=2)
-    options = PursuitOptions(macro_seconds=macro_seconds, switches=0)
+    options = PursuitOptions(macro_seconds=macro_seconds, switches=0, completion_weight=1.0)
     candidates = [Itinerary.plain(w) for w in (0, 5, MAP.stay)] + [Itinerary(17, 9, 60), Itinerary(MAP.stay, 6, 3)]
     table = MAP.itinerary_table(POSE, 40, candidates)
     values = value_routes(table, sampled.positions, sampled.completed_tick, LAB.rewards, 0.3)
