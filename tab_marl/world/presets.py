@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from tab_marl.world.regions import Box, Disc
 from tab_marl.world.scenario import Checkpoint, Rewards, Scenario
@@ -32,26 +33,12 @@ def lab() -> Scenario:
 
 def paper() -> Scenario:
     """`lab` with the paper's reward alone: a completed mission costs the ego nothing."""
-    base = lab()
-    return Scenario(
-        name="paper",
-        checkpoints=base.checkpoints,
-        obstacles=base.obstacles,
-        ego_start=base.ego_start,
-        adversary_start=base.adversary_start,
-        rewards=Rewards(mission_completed=0.0),
-    )
+    return replace(lab(), name="paper", rewards=Rewards(mission_completed=0.0))
 
 
 def open_field() -> Scenario:
-    """No obstacles: for first tries and closed forms."""
-    base = lab()
-    return Scenario(
-        name="open",
-        checkpoints=base.checkpoints,
-        ego_start=base.ego_start,
-        adversary_start=base.adversary_start,
-    )
+    """`lab` without obstacles: for first tries and closed forms."""
+    return replace(lab(), name="open", obstacles=())
 
 
 def reef() -> Scenario:
