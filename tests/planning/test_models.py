@@ -331,9 +331,10 @@ def test_the_guard_weighs_up_as_the_model_is_contradicted() -> None:
     # Within reach of the start, and still able to complete.
     assert np.hypot(*(now - (1.4, 0.4)).T).max() < 26 * REACH + 0.3
     assert (paths.completed_tick >= 0).mean() > 0.5
-    # A sighting ends all doubt about where it is.
-    model.observe(TickObservation(26, FAR, Sighting(0.7, 2.3, 2.0, 0.2)), rng)
-    assert model.share == 0.0
+    # A sighting ends all doubt about where it is, though not about where it goes.
+    model.observe(TickObservation(26, FAR, Sighting(0.7, 2.1, 2.0, 0.2)), rng)
+    assert model.share == pytest.approx(0.05)
+    assert np.hypot(*(model.sample(200, 5, rng).positions[:, 0] - (0.7, 2.1)).T).max() < 0.2
     model.observe(TickObservation(27, FAR, Sighting(0.75, 2.1, 2.0, 0.2, age_seconds=0.2)), rng)
     assert model.share == pytest.approx(0.05, abs=0.01)
 

@@ -1,8 +1,8 @@
 """A guard against believing too much: any adversary model, mixed with "it may be anywhere, and goes straight for it".
 
 A model that is sure of a wrong path sends the ego away from the one place worth guarding. The guard holds a second
-hypothesis with a small prior: the adversary is at any point that it could have reached unseen since it was last seen, and
-takes the shortest path from there. Bayes' rule weighs it up as observations contradict the model, and down never below
+hypothesis with a small prior: the adversary is where it is seen, or at any point that it could have reached unseen since,
+and takes the shortest path from there. Bayes' rule weighs it up as observations contradict the model, and down never below
 the prior.
 """
 
@@ -122,8 +122,11 @@ class Guarded:
             self._metres, self._seen_tick = grid.distances(grid.cells_of([point])), observation.tick
             if observation.tick > 0:
                 self._read(point)
-        if observation.seen_now or self._location < 0:
+        if self._location < 0:
             self._possible = np.empty(0, dtype=np.int64)
+            return
+        if observation.seen_now and seen is not None:
+            self._possible = grid.cells_of([(seen.x, seen.y)]).astype(np.int64)
             return
         reach = (observation.tick - self._seen_tick + 1) * self.map.reach_metres
         possible = self._metres <= reach
