@@ -129,12 +129,14 @@ class PlannerAgent:
         self._steps_per_decision = scenario.control_hertz // scenario.decision_hertz
         self._step = 0
         self._latest: tuple[int, Sighting] | None = None
+        self._track: list[tuple[float, float]] = []
 
     def act(self, observation: ArrayLike) -> NDArray[np.float32]:
         view = parse_ego_observation(observation)
         if view.adversary is not None:
             seen = view.adversary
             self._latest = (self._step, Sighting(seen.x, seen.y, seen.theta, abs(seen.v)))
+            self._track.append((seen.x, seen.y))
         started = time.perf_counter()
         if self._step % self._steps_per_tick == 0:
             self._update(view)
@@ -188,10 +190,10 @@ class PlannerAgent:
             age = (self._step - step) / self.task.scenario.control_hertz
             sighting = Sighting(seen.x, seen.y, seen.theta, seen.speed, age)
         tick = self._step // self._steps_per_tick
-        observation = TickObservation(tick, (view.x, view.y), sighting)
+        observation = TickObservation(tick, (view.x, view.y), sighting, tuple(self._track))
         (self._model.start if tick == 0 else self._model.observe)(observation, self.rng)
         self._scenarios.advance(observation)
-        self._latest = None
+        self._latest, self._track = None, []
 
     def _decide(self, view: EgoView) -> None:
         assert self._model is not None

@@ -359,3 +359,21 @@ def test_after_completion_the_adversary_wanders() -> None:
     assert (pool.positions[:, :24] == before[:, :24]).all()
     steps = np.hypot(*np.moveaxis(np.diff(pool.positions[:, 23:], axis=1), -1, 0))
     assert 0.05 < steps.mean() < 0.09 and steps.max() <= REACH + 1e-9
+
+
+def test_a_place_visited_between_two_ticks_counts() -> None:
+    """The environment's monitor looks ten times a second; so must whoever follows the mission by sightings."""
+    m = MissionMap.build(OPEN, EXACT)
+    edge = ((0.79, 2.5), (0.67, 2.5), (0.79, 2.55))  # in A's disc for a moment
+    assert m.label(m.automaton.initial, edge[2]) == int(m.automaton.masks(edge[2])[0])
+    mask = m.label(m.automaton.initial, edge[2], edge)
+    assert m.automaton.next_location[m.automaton.initial, mask] not in (m.automaton.initial, -2)
+    for name in ("MLE", "FP"):
+        model, rng = make(name, EXACT), RNG(15)
+        model.start(TickObservation(0, FAR), rng)
+        for tick in range(1, 30):
+            model.observe(TickObservation(tick, FAR), rng)
+        model.observe(TickObservation(30, FAR, Sighting(*edge[2], 0.5, 0.2), edge), rng)
+        after = model.sample(40, 40, rng).positions
+        # A is done: it goes on to B, and never back.
+        assert (np.hypot(*np.moveaxis(after[:, -1] - (2.5, 2.5), -1, 0)) < 1.0).mean() > 0.8

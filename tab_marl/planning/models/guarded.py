@@ -62,7 +62,7 @@ class Guarded:
         sources = inside if len(inside) else grid.cells_of([scenario.adversary_start.centre])
         self._metres = grid.distances(sources)
         self._seen_tick = self._tick = 0
-        self._read(grid.centres[sources[0]])
+        self._read(*grid.centres[sources[0]])
         self._update(observation)
 
     def observe(self, observation: TickObservation, rng: np.random.Generator) -> None:
@@ -109,8 +109,8 @@ class Guarded:
         learned: dict[str, Any] | None = getattr(self.model, "learned_state", lambda: None)()
         return learned
 
-    def _read(self, point: NDArray[np.float64]) -> None:
-        mask = self.map.mask_at(float(point[0]), float(point[1]))
+    def _read(self, x: float, y: float, track: tuple[tuple[float, float], ...] = ()) -> None:
+        mask = self.map.label(self._location, (x, y), track)
         self._location = int(kernels.read_label(self._location, self._clocks, mask, self.map.rules))
 
     def _update(self, observation: TickObservation) -> None:
@@ -118,10 +118,10 @@ class Guarded:
         grid, scenario = self.map.grid, self.map.scenario
         seen = observation.sighting
         if seen is not None:
-            point = np.array([seen.x, seen.y])
-            self._metres, self._seen_tick = grid.distances(grid.cells_of([point])), observation.tick
+            self._metres = grid.distances(grid.cells_of([(seen.x, seen.y)]))
+            self._seen_tick = observation.tick
             if observation.tick > 0:
-                self._read(point)
+                self._read(seen.x, seen.y, observation.track)
         if self._location < 0:
             self._possible = np.empty(0, dtype=np.int64)
             return

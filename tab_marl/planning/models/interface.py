@@ -31,6 +31,8 @@ class TickObservation:
     ego: tuple[float, float]
     sighting: Sighting | None = None
     """None: in no camera disc, neither at the tick nor since the one before."""
+    track: tuple[tuple[float, float], ...] = ()
+    """Where it was seen at each control step since the tick before, oldest first: it may have visited a place meanwhile."""
 
     @property
     def seen_now(self) -> bool:

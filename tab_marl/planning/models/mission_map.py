@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.mission.automaton import UNBOUNDED, MissionAutomaton
+from tab_marl.mission.automaton import FAILED, UNBOUNDED, MissionAutomaton
 from tab_marl.mission.compile import compile_mission
 from tab_marl.mission.model import Mission
 from tab_marl.mission.route import RouteField, solve_route
@@ -91,6 +91,19 @@ class MissionMap:
         r = min(max(int(y / self.ground.square_metres), 0), rows - 1)
         c = min(max(int(x / self.ground.square_metres), 0), columns - 1)
         return int(self.ground.mask[r, c])
+
+    def label(self, location: int, point: tuple[float, float], track: tuple[tuple[float, float], ...] = ()) -> int:
+        """The label that counts at a tick: that of the first point seen since the last tick that moves the mission on, else
+        that of the point where it is now.
+        """
+        here = int(self.automaton.masks(point)[0])
+        if location < 0:
+            return here
+        for mask in self.automaton.masks(np.array(track).reshape(-1, 2)):
+            following = int(self.automaton.next_location[location, mask])
+            if following not in (location, FAILED):
+                return int(mask)
+        return here
 
 
 @lru_cache(maxsize=64)

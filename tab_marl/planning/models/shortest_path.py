@@ -154,7 +154,7 @@ class ShortestPath:
             before.append((int(paths.locations[best, then]), paths.clocks[best, then].copy()))
         shares -= np.logaddexp.reduce(shares)
         shares = np.maximum(shares, math.log(self.options.doubt / len(shares)))
-        self._grow(self._point(observation)[None], before, shares, rng)
+        self._grow(self._point(observation)[None], before, shares, rng, observation.track)
 
     def _index(self) -> int:
         """Column of the hypotheses that is now."""
@@ -172,6 +172,7 @@ class ShortestPath:
         before: list[tuple[int, NDArray[np.int32]]],
         log_shares: NDArray[np.float64],
         rng: np.random.Generator,
+        track: tuple[tuple[float, float], ...] = (),
     ) -> None:
         """Follow every hypothesis to the episode's end; `before`: location and clocks by choice, one tick ago.
 
@@ -182,19 +183,20 @@ class ShortestPath:
         for c, m in enumerate(self.maps):
             for x, y in starts:
                 clocks = before[c][1].copy()
-                location = int(kernels.read_label(before[c][0], clocks, m.mask_at(x, y), m.rules))
+                mask = m.label(before[c][0], (x, y), track)
+                location = int(kernels.read_label(before[c][0], clocks, mask, m.rules))
                 kinds = self._kinds(m, (x, y), location, clocks)
                 for share, delay, pace in kinds:
-                    track = np.empty((ticks + 1, 2))
+                    path = np.empty((ticks + 1, 2))
                     stages, states = np.empty(ticks + 1, dtype=np.int32), np.empty((ticks + 1, 3), dtype=np.int32)
                     done = kernels.follow_way(
-                        x, y, location, clocks, delay, pace, m.reach_metres, m.rules, m.ways, m.ground, track, stages,
+                        x, y, location, clocks, delay, pace, m.reach_metres, m.rules, m.ways, m.ground, path, stages,
                         states,
                     )  # fmt: skip
                     if done >= 0 or location < 0:
-                        kernels.wander(track, max(done, 0), m.reach_metres, m.ground, rng)
+                        kernels.wander(path, max(done, 0), m.reach_metres, m.ground, rng)
                     prior = float(log_shares[c]) + math.log(share / len(starts))
-                    grown.append((c, prior, track, stages, states, 0 if location == -1 else done))
+                    grown.append((c, prior, path, stages, states, 0 if location == -1 else done))
         choice, priors, positions, locations, clock_rows, completed = zip(*grown, strict=True)
         self._paths = _Hypotheses(
             self._tick, np.array(choice, dtype=np.int32), np.array(positions), np.array(locations),

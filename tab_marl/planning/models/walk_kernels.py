@@ -66,6 +66,13 @@ def read_labels(x, y, location, clocks, rules, ground):
 
 
 @njit(cache=True)
+def read_same_label(location, clocks, mask, rules):
+    """`read_labels` where all N points have the same label."""
+    for i in range(location.shape[0]):
+        location[i] = read_label(location[i], clocks[i], mask, rules)
+
+
+@njit(cache=True)
 def wander(positions, start, reach, ground, rng):
     """From tick `start` on, uniform random moves in place of what `positions` ``[T + 1, 2]`` held."""
     for t in range(start + 1, positions.shape[0]):

@@ -192,7 +192,12 @@ class Walker:
             self._xy = np.tile(point, (self.particles, 1))
         else:
             self._xy = point + rng.normal(0.0, 0.5 * travelled / 2 + 0.01, (self.particles, 2))
-        self._read_labels()
+        for u in np.unique(self._location):
+            mask = self.map.label(int(u), (seen.x, seen.y), observation.track)
+            members = np.flatnonzero(self._location == u)
+            location, clocks = self._location[members], self._clocks[members]
+            kernels.read_same_label(location, clocks, mask, self.map.rules)
+            self._location[members], self._clocks[members] = location, clocks
         self._resample(np.exp(-0.5 * (gap / width) ** 2), rng)
 
     def _resample(self, weight: NDArray[np.float64], rng: np.random.Generator) -> None:
