@@ -368,7 +368,7 @@ def test_a_place_visited_between_two_ticks_counts() -> None:
     assert m.label(m.automaton.initial, edge[2]) == int(m.automaton.masks(edge[2])[0])
     mask = m.label(m.automaton.initial, edge[2], edge)
     assert m.automaton.next_location[m.automaton.initial, mask] not in (m.automaton.initial, -2)
-    for name in ("MLE", "FP"):
+    for name in ("MLE", "FP", "TAB"):
         model, rng = make(name, EXACT), RNG(15)
         model.start(TickObservation(0, FAR), rng)
         for tick in range(1, 30):

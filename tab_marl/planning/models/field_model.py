@@ -14,11 +14,14 @@ from tab_marl.field.solve import solve
 from tab_marl.field.tab_field import TabField
 from tab_marl.mission.model import Mission
 from tab_marl.planning.models.interface import SampledPaths, TickObservation
+from tab_marl.planning.models.mission_map import MissionMap
 from tab_marl.world.grid import GridMap
 from tab_marl.world.scenario import Scenario
 
 ALL_DONE = 1e-3
 """With less than this chance that the mission is still under way, the hunt is for the reference process."""
+AGREEING_SHARE = 0.05
+"""With at least this probability on the mission states that a sighting leaves, they are kept as they are."""
 SUBCELLS = 5
 """Points per side of a cell at which a camera's view is tested."""
 
@@ -47,6 +50,7 @@ class FieldModel:
         grid = self.field.problem.grid
         assert grid is not None  # a field made from a mission has one
         self.grid = grid
+        self.map = MissionMap.build(scenario, mission)
         self._cover = camera_cover(scenario, grid)
         self.belief = self.field.belief()
         self._at_sighting = 0.0
@@ -65,8 +69,11 @@ class FieldModel:
         self._condition(observation)
 
     def observe(self, observation: TickObservation, rng: np.random.Generator) -> None:
+        before = self.belief.automaton_states, self.belief.masses.sum(axis=1)
         self.belief.predict()
         self._condition(observation)
+        if observation.sighting is not None:
+            self._read_places(*before, observation)
 
     def sample(self, count: int, ticks: int, rng: np.random.Generator) -> SampledPaths:
         belief = self.belief
@@ -95,3 +102,34 @@ class FieldModel:
             if not np.isfinite(self.belief.log_evidence):  # the filter fell back: it starts anew from here
                 self.belief.log_evidence = 0.0
             self._at_sighting = self.belief.log_evidence
+
+    def _read_places(
+        self, states: NDArray[np.int32], totals: NDArray[np.float64], observation: TickObservation
+    ) -> None:
+        """Correct what the mission's state is by where the adversary was really seen, to the centimetre and ten times a
+        second, instead of by the cell that it is in at the tick.
+
+        `states` and `totals` are the automaton states a tick ago and their probabilities.
+        """
+        belief, automaton, seen = self.belief, self.field.problem.automaton, observation.sighting
+        assert seen is not None
+        if self.field.problem.options.kernel != "bridge":
+            return
+        following = np.empty_like(states)
+        for location in np.unique(automaton.location[states]):
+            mask = self.map.label(int(location), (seen.x, seen.y), observation.track)
+            if mask not in automaton.masks:  # no cell has this label
+                return
+            members = automaton.location[states] == location
+            following[members] = automaton.delta[states[members], int(automaton.symbols([mask])[0])]
+        targets, index = np.unique(following, return_inverse=True)
+        agreeing = np.isin(belief.automaton_states, targets)
+        if agreeing.all():
+            return
+        if belief.masses[agreeing].sum() > AGREEING_SHARE:
+            belief.automaton_states, belief.masses = belief.automaton_states[agreeing], belief.masses[agreeing]
+        else:
+            rows = np.bincount(index, weights=totals)[:, None] * belief.masses.sum(axis=0)
+            feasible = rows * (belief.chain.norm[targets] > 0)
+            belief.automaton_states, belief.masses = targets.astype(np.int32), feasible if feasible.any() else rows
+        belief.masses = belief.masses / belief.masses.sum()
