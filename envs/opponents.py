@@ -21,6 +21,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from tab_marl.envs import adversary_kernels as rows
 from tab_marl.envs.ego_observation import parse_ego_observation
 from tab_marl.envs.lidar import Lidar
 from tab_marl.mission.tasks import Task
@@ -74,25 +75,30 @@ class Random:
         return self._action
 
 
+def follow_route(observation: NDArray[np.float32], turn_per_step: float) -> Action:
+    """Turn towards the observed route and drive along it; wait where that would be too early.
+
+    `observation`: ``[D]`` or ``[N, D]`` of the adversary; `turn_per_step`: largest turn in one control step, rad.
+    Returns actions ``[2]`` or ``[N, 2]`` in [-1, 1].
+    """
+    o = np.atleast_2d(observation)
+    forward, left = o[:, rows.O_ROUTE], o[:, rows.O_ROUTE + 1]
+    waits = (o[:, rows.O_TARGET] > 0.5) & (10.0 * o[:, rows.O_TARGET + 1] > EARLY_SECONDS)
+    nowhere = (forward == 0) & (left == 0)
+    speed = np.where((forward < 0.5) | waits | nowhere, 0.0, np.minimum(forward, o[:, rows.O_LIMIT]))
+    turn = np.clip(np.arctan2(left, forward) / turn_per_step, -1.0, 1.0)
+    action = np.stack([2.0 * speed - 1.0, np.where(nowhere, 0.0, turn)], axis=1).astype(np.float32)
+    return action if np.ndim(observation) == 2 else action[0]
+
+
 class Follow:
-    """Follows the route in the adversary's observation (rows of `adversary_observation`)."""
+    """Follows the route in the adversary's observation (`follow_route`)."""
 
     def reset(self, task: Task, rng: np.random.Generator) -> None:
-        scenario = task.scenario
-        self._max_turn = scenario.adversary.max_turn_rate
-        self._seconds = 1.0 / scenario.control_hertz
+        self._turn_per_step = task.scenario.adversary.max_turn_rate / task.scenario.control_hertz
 
     def act(self, observation: NDArray[np.float32]) -> Action:
-        forward, left, near, speed_limit = (float(observation[i]) for i in (0, 1, 2, 15))
-        timed, excess_seconds = observation[9] > 0.5, 10.0 * float(observation[10])
-        if (forward == 0.0 and left == 0.0) or near == 0.0:
-            return STAND_STILL
-        error = math.atan2(left, forward)
-        turn = min(max(error / self._seconds / self._max_turn, -1.0), 1.0)
-        speed = max(forward, 0.0) if forward > 0.5 else 0.0
-        if timed and excess_seconds > EARLY_SECONDS:
-            speed = 0.0
-        return np.array([2.0 * min(speed, speed_limit) - 1.0, turn], dtype=np.float32)
+        return follow_route(observation, self._turn_per_step)
 
 
 class Pursue:

@@ -18,7 +18,7 @@ from tab_marl.evaluation.errors import UserError
 from tab_marl.evaluation.findings import findings
 from tab_marl.evaluation.paper import MISSION_TEXT, PAPER, TAB_TIME_RATIO
 from tab_marl.evaluation.rows import EpisodeRow, Timing, scored_completed
-from tab_marl.evaluation.settings import HEADLINE, PAPER_PLANNERS, PLANNERS
+from tab_marl.evaluation.settings import HEADLINE, PLANNERS
 from tab_marl.evaluation.statistics import Interval, Paired
 from tab_marl.evaluation.tables import ALL, Line, Share
 
@@ -224,8 +224,3 @@ def _difference(paired: Paired | None, scale: float) -> Markup:
     return Markup('<span class="{}">{:+.0f}</span> <span class="ci">[{:+.0f}, {:+.0f}] p {}</span>').format(
         style, scale * d.value, scale * d.low, scale * d.high, statistics.stars(paired.p_value)
     )
-
-
-def paper_planners_present(rows: Sequence[EpisodeRow]) -> list[str]:
-    """The paper's planners that have rows."""
-    return [p for p in PAPER_PLANNERS if any(r.planner == p for r in rows)]
