@@ -36,9 +36,9 @@ from tab_marl.planning.models.mission_map import MissionMap
 from tab_marl.planning.models.pool import PoolOptions, TrajectoryPool
 from tab_marl.planning.models.shortest_path import ShortestPath, ShortestPathOptions
 from tab_marl.planning.models.walker import MoveCounts, Walker
-from tab_marl.planning.pursuit import Decision, PursuitOptions, decide
-from tab_marl.planning.routes import RouteMap, RouteOptions
-from tab_marl.planning.scenarios import ReuseOptions, ScenarioSet
+from tab_marl.planning.pursuit.decide import Decision, PursuitOptions, decide
+from tab_marl.planning.pursuit.routes import RouteMap, RouteOptions
+from tab_marl.planning.pursuit.scenarios import ReuseOptions, ScenarioSet
 from tab_marl.world.scenario import UnknownName
 
 PLANNERS = ("S-POMCP", "FP-POMCP", "MLE-POMCP", "TAB-POMCP", "oracle", "population-POMCP", "random")

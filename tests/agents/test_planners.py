@@ -11,7 +11,7 @@ from tab_marl.envs.ego_observation import observe_ego
 from tab_marl.envs.physics import Motion
 from tab_marl.mission.model import Constraint, Mission
 from tab_marl.mission.tasks import Task, sample_task
-from tab_marl.planning.pursuit import PursuitOptions
+from tab_marl.planning.pursuit.decide import PursuitOptions
 from tab_marl.world.kernels import steer, unicycle_step
 from tab_marl.world.regions import Disc
 from tab_marl.world.scenario import Checkpoint, Scenario, UnknownName

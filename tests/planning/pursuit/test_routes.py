@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from tab_marl.planning.motion_kernels import clear_line
-from tab_marl.planning.routes import RouteMap, RouteOptions
+from tab_marl.planning.pursuit.motion_kernels import clear_line
+from tab_marl.planning.pursuit.routes import RouteMap, RouteOptions
 from tab_marl.world.grid import free_points
 from tab_marl.world.kernels import steer, unicycle_step
 from tab_marl.world.scenario import Scenario

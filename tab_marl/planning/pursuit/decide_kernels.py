@@ -15,8 +15,8 @@ import math
 import numpy as np
 from numba import njit
 
-from tab_marl.planning.interception_kernels import meeting_fraction
-from tab_marl.planning.motion_kernels import drive
+from tab_marl.planning.pursuit.interception_kernels import meeting_fraction
+from tab_marl.planning.pursuit.motion_kernels import drive
 from tab_marl.world.kernels import unicycle_step
 
 UNSEEN = 0

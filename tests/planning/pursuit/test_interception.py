@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from tab_marl.planning.interception import NEVER, value_routes
-from tab_marl.planning.interception_kernels import first_meeting, meeting_fraction
-from tab_marl.planning.routes import RouteTable
+from tab_marl.planning.pursuit.interception import NEVER, value_routes
+from tab_marl.planning.pursuit.interception_kernels import first_meeting, meeting_fraction
+from tab_marl.planning.pursuit.routes import RouteTable
 from tab_marl.world.scenario import Rewards
 
 REWARDS = Rewards()

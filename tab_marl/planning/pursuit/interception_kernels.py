@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import njit
 
-from tab_marl.planning.motion_kernels import shortcut
+from tab_marl.planning.pursuit.motion_kernels import shortcut
 
 NEVER = -1.0
 """No meeting."""

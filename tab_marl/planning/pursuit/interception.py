@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.planning import interception_kernels
-from tab_marl.planning.routes import RouteTable
+from tab_marl.planning.pursuit import interception_kernels
+from tab_marl.planning.pursuit.routes import RouteTable
 from tab_marl.world.scenario import Rewards
 
 NEVER = interception_kernels.NEVER

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from tab_marl.planning import motion_kernels
+from tab_marl.planning.pursuit import motion_kernels
 from tab_marl.world.grid import BLOCKED, GridMap
 from tab_marl.world.scenario import Scenario, require_positive
 

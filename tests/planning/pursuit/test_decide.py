@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from numba import njit
 
-from tab_marl.planning import pursuit_kernels
-from tab_marl.planning.interception import value_routes
 from tab_marl.planning.models.interface import SampledPaths
-from tab_marl.planning.pursuit import PursuitOptions, decide, pursuit_model
-from tab_marl.planning.routes import Itinerary, RouteMap
+from tab_marl.planning.pursuit import decide_kernels
+from tab_marl.planning.pursuit.decide import PursuitOptions, decide, pursuit_model
+from tab_marl.planning.pursuit.interception import value_routes
+from tab_marl.planning.pursuit.routes import Itinerary, RouteMap
 from tab_marl.world.regions import Disc
 from tab_marl.world.scenario import Checkpoint, Scenario
 
@@ -51,7 +51,7 @@ def test_steps_and_rollout_add_up_to_the_open_loop_return(macro_seconds: float) 
     table = MAP.itinerary_table(POSE, 40, candidates)
     values = value_routes(table, sampled.positions, sampled.completed_tick, LAB.rewards, 0.3)
     model = pursuit_model(MAP, POSE, sampled, values, candidates, options)
-    step, rollout = njit(pursuit_kernels.step), njit(pursuit_kernels.rollout)
+    step, rollout = njit(decide_kernels.step), njit(decide_kernels.rollout)
     outcomes = {"met": 0, "not met": 0}
     for a in range(len(candidates)):
         for k in range(40):
@@ -81,9 +81,9 @@ def test_macro_actions_stop_when_a_camera_begins_to_see() -> None:
     options = PursuitOptions(macro_seconds=30.0, branch_on_sightings=True)
     model = pursuit_model(MAP, POSE, sampled, values, candidates, options)
     state = np.array([0.0, 0.0, *POSE])
-    seen, _reward, over = njit(pursuit_kernels.step)(state, 0, model.data, np.zeros(1, dtype=np.uint64))
+    seen, _reward, over = njit(decide_kernels.step)(state, 0, model.data, np.zeros(1, dtype=np.uint64))
     entered = int(np.argmax(np.hypot(*(line - (camera.x, camera.y)).T) <= camera.camera_metres))
-    assert seen != pursuit_kernels.UNSEEN and not over
+    assert seen != decide_kernels.UNSEEN and not over
     assert state[1] == entered
 
 

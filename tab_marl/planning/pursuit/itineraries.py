@@ -13,11 +13,11 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.planning import interception_kernels
-from tab_marl.planning.interception import RouteValues, value_routes
 from tab_marl.planning.models.interface import SampledPaths
-from tab_marl.planning.pursuit_kernels import TURN_TICKS
-from tab_marl.planning.routes import Itinerary, RouteMap, RouteTable
+from tab_marl.planning.pursuit import interception_kernels
+from tab_marl.planning.pursuit.decide_kernels import TURN_TICKS
+from tab_marl.planning.pursuit.interception import RouteValues, value_routes
+from tab_marl.planning.pursuit.routes import Itinerary, RouteMap, RouteTable
 from tab_marl.world.scenario import Rewards
 
 Pose = tuple[float, float, float]

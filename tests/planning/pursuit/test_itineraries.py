@@ -5,13 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from tab_marl.planning import interception_kernels
-from tab_marl.planning.interception import value_routes
-from tab_marl.planning.interception_kernels import first_meeting, meeting_fraction
-from tab_marl.planning.itineraries import PursuitOptions, covering, geometry_of, shortlist
 from tab_marl.planning.models.interface import SampledPaths, Sighting, TickObservation
-from tab_marl.planning.routes import Itinerary, RouteMap
-from tab_marl.planning.scenarios import ReuseOptions, ScenarioSet
+from tab_marl.planning.pursuit import interception_kernels
+from tab_marl.planning.pursuit.interception import value_routes
+from tab_marl.planning.pursuit.interception_kernels import first_meeting, meeting_fraction
+from tab_marl.planning.pursuit.itineraries import PursuitOptions, covering, geometry_of, shortlist
+from tab_marl.planning.pursuit.routes import Itinerary, RouteMap
+from tab_marl.planning.pursuit.scenarios import ReuseOptions, ScenarioSet
 from tab_marl.world.scenario import Scenario
 
 RNG = np.random.default_rng

@@ -13,13 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.planning import interception_kernels, pursuit_kernels
-from tab_marl.planning.interception import RouteValues
-from tab_marl.planning.itineraries import Geometry, Pose, PursuitOptions, geometry_of, shortlist, weighed
 from tab_marl.planning.model import CompiledModel
 from tab_marl.planning.models.interface import SampledPaths
 from tab_marl.planning.pomcp import Plan, Pomcp, PomcpOptions
-from tab_marl.planning.routes import Itinerary, RouteMap
+from tab_marl.planning.pursuit import decide_kernels, interception_kernels
+from tab_marl.planning.pursuit.interception import RouteValues
+from tab_marl.planning.pursuit.itineraries import Geometry, Pose, PursuitOptions, geometry_of, shortlist, weighed
+from tab_marl.planning.pursuit.routes import Itinerary, RouteMap
 from tab_marl.world.scenario import Scenario
 
 TRIED_SHARE = 0.3
@@ -101,7 +101,7 @@ def pursuit_model(
     first, switch, second = np.array(candidates, dtype=np.int64).T.copy()
     points = np.concatenate([routes.waypoints, [pose[:2]]])[np.concatenate([first, second])]
     contacts = Contacts(routes.distances, *np.empty((2, len(points), len(paths))))
-    pursuit_kernels.contacts(paths, completed, points, radius, contacts.first, contacts.last)
+    decide_kernels.contacts(paths, completed, points, radius, contacts.first, contacts.last)
     data = PursuitData(
         paths,
         completed,
@@ -125,7 +125,7 @@ def pursuit_model(
         contacts,
     )  # fmt: skip
     return CompiledModel(
-        pursuit_kernels.step, len(first), 5, data, rollout=pursuit_kernels.rollout, prior=pursuit_kernels.prior
+        decide_kernels.step, len(first), 5, data, rollout=decide_kernels.rollout, prior=decide_kernels.prior
     )
 
 

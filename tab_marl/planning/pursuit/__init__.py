@@ -1,0 +1,1 @@
+"""The interceptor: itineraries valued against sampled adversary paths, and the tree over changing them."""
