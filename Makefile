@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # Set this to an empty string to try newer libraries than those tested.
 CONSTRAINTS ?= -c constraints.txt
 
-.PHONY: demo test lint typecheck format clean
+.PHONY: demo test lint typecheck format docs clean
 
 demo: $(VENV)/.installed
 	$(BIN)/tab-marl evaluate --preset demo --out runs/demo
@@ -26,6 +26,11 @@ typecheck: $(VENV)/.installed-dev
 format: $(VENV)/.installed-dev
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+docs: $(VENV)/.installed-dev
+	$(BIN)/python scripts/link_typecheck.py
+	$(BIN)/mkdocs build --strict --clean
+	@echo "open build/site/index.html"
 
 $(BIN)/python:
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "tab_marl needs Python 3.11 or newer: make PYTHON=python3.11 ...")'
