@@ -1,39 +1,20 @@
-"""Textbook POMDPs with published values, to hold the planner against: Tiger and Tag."""
+"""Tag (Pineau, Gordon and Thrun, IJCAI 2003): a robot seeks a target that it sees only when on top of it."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.planning import textbook_kernels as kernels
-from tab_marl.planning.model import CompiledModel, table_model
+from tab_marl.planning.model import CompiledModel
+from tab_marl.planning.textbook import chase_maps
+from tab_marl.planning.textbook import tag_kernels as kernels
+from tab_marl.planning.textbook.chase_maps import TAG
 
-LISTEN, OPEN_LEFT, OPEN_RIGHT = 0, 1, 2
-HEAR_LEFT, HEAR_RIGHT = 0, 1
-
-NORTH, EAST, SOUTH, WEST, TAG = 0, 1, 2, 3, kernels.TAG
 SEES_TARGET = kernels.SEES_TARGET
-
-
-def tiger(accuracy: float = 0.85, rollout: Literal["patient", "engine"] = "patient") -> CompiledModel:
-    """Tiger (Kaelbling, Littman and Cassandra, AIJ 1998): listen for -1, a good door is worth 10, the tiger's -100.
-
-    State 0: the tiger is left; opening a door places it anew. With `accuracy` .85 and discount .95 the best value from the
-    uniform belief is 19.37: listen until one side was heard twice more often than the other. `rollout` "patient" does just that
-    from scratch; "engine" opens doors at random for -30 a step, under which a tree of a million simulations stays buried.
-    """
-    stay, anew = np.eye(2), np.full((2, 2), 0.5)
-    hear = np.array([[accuracy, 1 - accuracy], [1 - accuracy, accuracy]])
-    model = table_model(
-        transition=[stay, anew, anew],
-        observation=[hear, anew, anew],
-        reward=[[-1, -1], [-100, 10], [10, -100]],
-        action_names=("listen", "open left", "open right"),
-    )
-    return replace(model, rollout=kernels.patient_rollout) if rollout == "patient" else model
+PLACES = [(x, y) for y in range(2) for x in range(10)] + [(x, y) for y in range(2, 5) for x in range(5, 8)]
+"""The 29 cells as (x, y): two rows of ten and a block of 3 x 3 above columns 5 to 7."""
 
 
 class TagData(NamedTuple):
@@ -49,46 +30,12 @@ class TagData(NamedTuple):
     """``[1]`` steps simulated inside rollouts, a counter for benchmarks."""
 
 
-_MAP = [(x, y) for y in range(2) for x in range(10)] + [(x, y) for y in range(2, 5) for x in range(5, 8)]
-"""The 29 cells: two rows of ten and a block of 3 x 3 above columns 5 to 7."""
-_STEPS = {NORTH: (0, 1), EAST: (1, 0), SOUTH: (0, -1), WEST: (-1, 0)}
-_CELL = {place: cell for cell, place in enumerate(_MAP)}
-
-
-def _moved(cell: int, direction: int) -> int:
-    (x, y), (dx, dy) = _MAP[cell], _STEPS[direction]
-    return _CELL.get((x + dx, y + dy), cell)
-
-
-def _flights(robot: int, target: int) -> list[int]:
-    """The target's next cells, equally likely: away along each axis with .4 (split where level), else it stays."""
-    (rx, ry), (tx, ty) = _MAP[robot], _MAP[target]
-    x = [EAST, WEST] if tx == rx else [EAST if tx > rx else WEST] * 2
-    y = [NORTH, SOUTH] if ty == ry else [NORTH if ty > ry else SOUTH] * 2
-    return [_moved(target, d) for d in x + y] + [target]
-
-
-def _worth_trying(cell: int, last: int) -> list[tuple[int, int]]:
-    """(action, cell after) of the free moves that do not double back; if there are none, of the free moves."""
-    free = [(d, _moved(cell, d)) for d in _STEPS if _moved(cell, d) != cell]
-    return [m for m in free if last == TAG or m[0] != (last + 2) % 4] or free
-
-
 def tag_data() -> TagData:
     """The tables of Tag."""
-    cells = range(kernels.CELLS)
-    robot = [_moved(c, a) if a != TAG else c for c in cells for a in range(5)]
-    target = [after for r in cells for t in cells for after in _flights(r, t)]
-    rollout = []
-    for c in cells:
-        for last in range(5):
-            moves = _worth_trying(c, last)
-            each = kernels.ROLLOUT_SLOTS // len(moves)
-            rollout += [a * 32 + after for a, after in moves for _ in range(each)]
     return TagData(
-        np.array(robot, dtype=np.int16),
-        np.array(target, dtype=np.int16),
-        np.array(rollout, dtype=np.int16),
+        chase_maps.robot_moves(PLACES),
+        chase_maps.target_moves(PLACES),
+        chase_maps.rollout_moves(PLACES, stride=32),
         np.zeros(1, dtype=np.int64),
     )
 
@@ -111,7 +58,7 @@ def tag(rollout: Literal["history", "uniform", "engine"] = "history", preferred:
         tag_data(),
         rollout=function,
         prior=kernels.preferred if preferred else None,
-        action_names=("north", "east", "south", "west", "tag"),
+        action_names=chase_maps.ACTION_NAMES,
     )
 
 

@@ -1,6 +1,7 @@
-"""Tag (Pineau, Gordon and Thrun, IJCAI 2003) as compiled functions, and a rollout for Tiger.
+# mypy: ignore-errors
+"""Tag (Pineau, Gordon and Thrun, IJCAI 2003) as compiled functions.
 
-Tag's tables are made in `tab_marl.planning.textbook`. Its state is ``[robot cell, target cell]``. Everything is one
+The tables are made in `tab_marl.planning.textbook.chase_maps`. The state is ``[robot cell, target cell]``. Everything is one
 look-up: the random word's upper half picks one of 5 equal slots of the target's moves, its lower half the robot's action in a rollout.
 (``np.uint64(...)`` round a call keeps the type where the functions run interpreted.)
 """
@@ -13,7 +14,6 @@ import numpy as np
 from numba import njit
 
 from tab_marl.planning.random_kernels import GOLDEN, bits, mixed
-from tab_marl.planning.table_kernels import draw
 
 TAG = 4
 CELLS = 29
@@ -33,23 +33,6 @@ def _high(word, count):
 @njit(cache=True)
 def _low(word, count):
     return np.int64(((word & _LOW) * np.uint64(count)) >> _SHIFT)
-
-
-def patient_rollout(state, action, observation, depth, max_depth, discount, data, rng):
-    """Tiger: listen until one side was heard twice more often, open the other door, and again, to the end."""
-    tiger = np.int64(state[0])
-    total = 0.0
-    weight = 1.0
-    surplus = 0
-    for _ in range(depth, max_depth):
-        door = 0 if abs(surplus) < 2 else (2 if surplus > 0 else 1)
-        after = draw(data.transition, door * 2 + tiger, rng)
-        heard = draw(data.observation, door * 2 + after, rng)
-        total += weight * data.reward[door * 2 + tiger, after]
-        weight *= discount
-        tiger = after
-        surplus = surplus + 1 - 2 * heard if door == 0 else 0
-    return total
 
 
 def step(state, action, data, rng):
