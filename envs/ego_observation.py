@@ -9,9 +9,11 @@ x, y                        own centre [m]
 cos, sin                    own heading
 v, w                        own speed [m/s] and turn rate [rad/s]
 elapsed, left               seconds since the start and until the horizon
-seen                        1 while a checkpoint camera sees the adversary (always 1 under `full_observation`), else 0
+seen                        1 while a checkpoint camera sees the adversary (in surveillance also while the ego watches it;
+                            always under `full_observation`), else 0
 adversary x, y, cos, sin,   the adversary's state while seen, else 0
 v, w
+goal x, y                   centre of the region that the ego must reach [m]; ego task avoidance only
 lidar 0 ..                  free distance [m], anticlockwise, the first ray along the heading
 ==========================  ==========================================================================================
 """
@@ -55,8 +57,16 @@ def ego_rows(scenario: Scenario) -> tuple[Row, ...]:
         Row("left", 0.0, horizon),
         Row("seen", 0.0, 1.0),
         *robot_rows("adversary ", scenario.adversary, w, h),
+        *goal_rows(scenario),
         *(Row(f"lidar {i}", 0.0, scenario.sensors.lidar_metres) for i in range(scenario.sensors.lidar_rays)),
     )
+
+
+def goal_rows(scenario: Scenario) -> tuple[Row, ...]:
+    """Two rows of the ego's own goal; none where its task has none."""
+    if scenario.ego_goal is None:
+        return ()
+    return (Row("goal x", 0.0, scenario.width_metres), Row("goal y", 0.0, scenario.height_metres))
 
 
 def robot_rows(prefix: str, robot: Robot, width: float, height: float) -> tuple[Row, ...]:
@@ -91,14 +101,18 @@ def observe_ego(
     adversary: Motion | None,
     ranges: NDArray[np.float64] | None,
     limits: tuple[float, float],
+    goal: tuple[float, float] | None = None,
 ) -> NDArray[np.float32]:
-    """The observation ``[15 + rays]``; `adversary` is None while unseen, `limits` the top speeds of ego and adversary."""
+    """The observation ``[15 + rays]``, two more with a goal; `adversary` is None while unseen, `limits` the top speeds of
+    ego and adversary, `goal` the centre of the region that the ego must reach, if there is one."""
     values = [*robot_values(own, limits[0]), elapsed, left]
     if adversary is None:
         values += _UNSEEN
     else:
         values.append(1.0)
         values += robot_values(adversary, limits[1])
+    if goal is not None:
+        values += goal
     if ranges is not None:
         values += ranges.tolist()
     return np.array(values, dtype=np.float32)
@@ -138,10 +152,16 @@ class EgoView:
     """None while no camera sees it."""
     lidar: NDArray[np.float32]
     """``[rays]`` metres."""
+    goal: tuple[float, float] | None = None
+    """Centre of the region that the ego must reach (avoidance)."""
 
 
-def parse_ego_observation(observation: ArrayLike) -> EgoView:
-    """Read an ego observation by name. Raises ValueError on a wrong shape."""
+def parse_ego_observation(observation: ArrayLike, scenario: Scenario | None = None) -> EgoView:
+    """Read an ego observation by name. Raises ValueError on a wrong shape.
+
+    `scenario`: needed where the ego has a goal of its own (avoidance); without it all rows after the first 15 are read as
+    lidar.
+    """
     array = np.asarray(observation, dtype=np.float32)
     if array.ndim != 1 or array.shape[0] < ROWS_WITHOUT_LIDAR:
         raise ValueError(
@@ -152,6 +172,15 @@ def parse_ego_observation(observation: ArrayLike) -> EgoView:
     adversary = None
     if o[_SEEN] > 0.5:
         adversary = AdversaryView(o[9], o[10], math.atan2(o[12], o[11]), o[13], o[14])
+    goal, lidar_at = None, ROWS_WITHOUT_LIDAR
+    if scenario is not None:
+        rows = len(ego_rows(scenario))
+        if array.shape[0] != rows:
+            raise ValueError(
+                f"an ego observation of scenario {scenario.name!r} has shape [{rows}], got {list(array.shape)}"
+            )
+        if scenario.ego_goal is not None:
+            goal, lidar_at = (float(array[lidar_at]), float(array[lidar_at + 1])), lidar_at + 2
     return EgoView(
-        o[0], o[1], math.atan2(o[3], o[2]), o[4], o[5], o[6], o[7], adversary, array[ROWS_WITHOUT_LIDAR:]
+        o[0], o[1], math.atan2(o[3], o[2]), o[4], o[5], o[6], o[7], adversary, array[lidar_at:], goal
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""One episode without any library's interface: physics, interception at every substep, the mission at the control rate."""
+"""One episode without any library's interface: physics, meeting at every substep, mission and ego task at the control rate."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from tab_marl.envs.lidar import Lidar
 from tab_marl.envs.physics import ADVERSARY, EGO, Arena, Start
 from tab_marl.envs.reward import Events
 from tab_marl.mission.monitor import Monitor
@@ -36,6 +37,14 @@ class Episode:
         self.physics_steps = 0
         self.control_steps = 0
         self.intercepted = False
+        self.encountered = False
+        """Ego task avoidance: the robots met, which ended the episode."""
+        self.arrived = False
+        """Ego task avoidance: the ego reached its goal, which ended the episode."""
+        self.watched = False
+        """Ego task surveillance: the ego watches the adversary now."""
+        self.watched_steps = 0
+        """Control steps at whose end the ego watched the adversary."""
         self.completed_seconds: float | None = None
         """When the mission was completed."""
         self.motion = (self.arena.motion(EGO), self.arena.motion(ADVERSARY))
@@ -52,6 +61,8 @@ class Episode:
         self._forgive_steps = round(scenario.step_seconds * scenario.control_hertz)
         self._meeting = scenario.interception_metres**2
         fastest = scenario.ego.max_speed + scenario.adversary.max_speed
+        self._ego_task = scenario.ego_task
+        self._sight = Lidar.of(scenario) if scenario.ego_task == "surveillance" else None
         self._safe_gap = (scenario.interception_metres + CLOSING_MARGIN * fastest / scenario.control_hertz) ** 2
         monitor.reset((self.motion[ADVERSARY].x, self.motion[ADVERSARY].y))
         self._sense()
@@ -61,12 +72,19 @@ class Episode:
         """Simulated so far; a step cut short by interception counts its substeps only."""
         return self.physics_steps / self.scenario.physics_hertz
 
+    @property
+    def ended(self) -> bool:
+        """Whether the ego's task is over; never in surveillance."""
+        return self.intercepted or self.encountered or self.arrived
+
     def step(self, ego: tuple[float, float], adversary: tuple[float, float]) -> Events:
-        """Advance one control step under (v [m/s], w [rad/s]) of each robot; stops at the substep of interception."""
+        """Advance one control step under (v [m/s], w [rad/s]) of each robot; stops at the substep in which they meet,
+        unless the ego's task is surveillance."""
         arena = self.arena
         active = self.monitor.status == "active"
         arena.command(ego, adversary)
-        if arena.squared_gap() > self._safe_gap:
+        met = False
+        if self._sight is not None or arena.squared_gap() > self._safe_gap:
             arena.run(self.substeps_per_step)
             self.physics_steps += self.substeps_per_step
         else:
@@ -74,22 +92,34 @@ class Episode:
                 arena.substep()
                 self.physics_steps += 1
                 if arena.squared_gap() <= self._meeting:
-                    self.intercepted = True
+                    met = True
                     break
         self.control_steps += 1
         self.motion = (arena.motion(EGO), arena.motion(ADVERSARY))
+        if self._ego_task == "interception":
+            self.intercepted = met
+        elif self._ego_task == "avoidance":
+            self.encountered = met
+            self.arrived = not met and self._at_goal()
         status = "active"
-        if active and not self.intercepted:
+        if active and not met:
             status = self._watch_mission()
         self._sense()
         return Events(
-            intercepted=self.intercepted,
-            completed=status == "completed",
-            failed=status == "failed",
-            ego_collided=self._collided(EGO),
-            adversary_collided=self._collided(ADVERSARY),
-            mission_active=active,
+            self.intercepted,
+            status == "completed",
+            status == "failed",
+            self._collided(EGO),
+            self._collided(ADVERSARY),
+            active,
+            self.encountered,
+            self.arrived,
+            self.watched,
         )
+
+    def _at_goal(self) -> bool:
+        goal = self.scenario.ego_goal
+        return goal is not None and bool(goal.contains(self.motion[EGO][:2]))
 
     def mission_progress(self) -> tuple[int, int]:
         """(goals completed, visits counted for the current one); stays where it was when the mission failed."""
@@ -111,7 +141,11 @@ class Episode:
         self.trails[EGO].append((ego_x, ego_y))
         self.trails[ADVERSARY].append((x, y))
         self.seen_by = tuple([i for i, cx, cy, reach in self._cameras if math.hypot(x - cx, y - cy) <= reach])
-        if self.seen_by:
+        if self._sight is not None:
+            near = math.hypot(x - ego_x, y - ego_y) <= self.scenario.watch_metres + BOUNDARY_METRES
+            self.watched = near and self._sight.sees(ego_x, ego_y, x, y)
+            self.watched_steps += self.watched and self.control_steps > 0
+        if self.seen_by or self.watched:
             self.last_seen = (x, y, self.seconds)
 
     def _collided(self, robot: int) -> bool:

@@ -3,7 +3,9 @@
 Agents are ``ego_0`` and ``adversary_0``; both act in ``[-1, 1]^2``: ``a[0]`` is the speed, from -1 (stand still) to 1
 (top speed), ``a[1]`` the turn rate, from -1 (clockwise at the top rate) to 1. Values beyond are clipped; NaN and
 infinities are refused. One step is one control step (0.1 s, ten physics substeps). An episode ends at interception
-(terminated) or at the horizon (truncated); with `end_on_completion` also when the mission is completed or fails.
+(terminated) or at the horizon (truncated); with `end_on_completion` also when the mission is completed or fails. Where the
+ego's task is avoidance (`Scenario.ego_task`), it ends when the robots meet or the ego is in its goal; surveillance runs to
+the horizon.
 """
 
 from __future__ import annotations
@@ -161,7 +163,7 @@ class InterceptEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
         events = episode.step(
             _command(actions, EGO_AGENT, scenario.ego), _command(actions, ADVERSARY_AGENT, scenario.adversary)
         )  # fmt: skip
-        ended = events.intercepted or (self.end_on_completion and (events.completed or events.failed))
+        ended = episode.ended or (self.end_on_completion and (events.completed or events.failed))
         truncated = not ended and episode.control_steps >= self._last_step
         seconds = self._control_seconds
         rewards = {
@@ -235,12 +237,13 @@ class InterceptEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
         ego, adversary = episode.motion
         scenario = episode.scenario
         elapsed = episode.seconds
-        seen = adversary if episode.seen_by or self.full_observation else None
+        seen = adversary if episode.seen_by or episode.watched or self.full_observation else None
+        goal = None if scenario.ego_goal is None else scenario.ego_goal.centre
         ranges = None if self._lidar is None else self._lidar.scan(ego.x, ego.y, ego.theta)
         limits = (scenario.ego.max_speed, scenario.adversary.max_speed)
         noticed = ego if notices_ego(scenario, adversary, ego) else None
         return {
-            EGO_AGENT: observe_ego(ego, elapsed, self._left(elapsed), seen, ranges, limits),
+            EGO_AGENT: observe_ego(ego, elapsed, self._left(elapsed), seen, ranges, limits, goal),
             ADVERSARY_AGENT: self._side.observe(adversary, noticed),
         }
 
@@ -258,12 +261,17 @@ class InterceptEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
             "physics_steps": episode.physics_steps,
         }
         return {
-            EGO_AGENT: {**common, "collided": events.ego_collided},
+            EGO_AGENT: {**common, "collided": events.ego_collided, **_ego_task_info(episode)},
             ADVERSARY_AGENT: {**common, "collided": events.adversary_collided},
         }
 
     def _check_shape(self, scenario: Scenario) -> None:
         """A task drawn or given at reset must fit the spaces, which cannot change."""
+        if scenario.ego_task != self._shape_of.ego_task:
+            raise ValueError(
+                f"the task's scenario {scenario.name!r} is for {scenario.ego_task}, the environment was made for "
+                f"{self._shape_of.ego_task}: make an environment for it"
+            )
         space, rows = self.observation_spaces[EGO_AGENT], ego_rows(scenario)
         if len(rows) != space.shape[0]:
             raise ValueError(
@@ -276,6 +284,15 @@ class InterceptEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
                     f"the task's scenario {scenario.name!r} needs {row.name} up to {row.high:g}, the environment was made "
                     f"for {high:g}: make an environment for it"
                 )
+
+
+def _ego_task_info(episode: Episode) -> dict[str, Any]:
+    """What the ego's info tells beyond interception."""
+    if episode.scenario.ego_task == "avoidance":
+        return {"encountered": episode.encountered, "arrived": episode.arrived}
+    if episode.scenario.ego_task == "surveillance":
+        return {"watched": episode.watched, "watched_seconds": episode.watched_steps / episode.scenario.control_hertz}
+    return {}
 
 
 def _state_rows(scenario: Scenario) -> tuple[Row, ...]:

@@ -1,13 +1,28 @@
 """Rewards of both sides, per control step.
 
-The ego's prices are `Scenario.rewards` (the paper's, plus the price of a completed mission); those per time step are for
-one tick of `Scenario.step_seconds` and are charged in proportion to the control step. The adversary's are the plain
-default below; learned adversaries are trained with a shaped one.
+The ego's prices are `Scenario.rewards` (the paper's, plus the price of a completed mission and those of the other ego
+tasks); those per time step are for one tick of `Scenario.step_seconds` and are charged in proportion to the control step:
+
+==================  ==========================  ==================================================================
+term                ego tasks                   when
+==================  ==========================  ==================================================================
+per_step, control   all                         every control step
+collision           all                         each time the ego starts touching a wall or an obstacle
+interception        interception                once, at interception
+mission_completed   interception                once, when the adversary completes its mission
+encounter           avoidance                   once, when the ego meets the adversary
+arrival             avoidance                   once, when the ego is in its goal
+watched             surveillance                per second, while the ego watches the adversary
+==================  ==========================  ==================================================================
+
+The adversary's are the plain default below; learned adversaries are trained with a shaped one. It is hunted in
+interception only: meeting the ego costs it nothing in the other tasks.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from tab_marl.envs.physics import Motion
 from tab_marl.world.scenario import Scenario
@@ -29,11 +44,11 @@ class AdversaryRewards:
     """Per tick of `Scenario.step_seconds`, while its mission is under way."""
 
 
-@dataclass(frozen=True, slots=True)
-class Events:
+class Events(NamedTuple):
     """What happened during one control step."""
 
     intercepted: bool = False
+    """Ego task interception: the robots met."""
     completed: bool = False
     """The mission was completed during this step."""
     failed: bool = False
@@ -43,18 +58,31 @@ class Events:
     adversary_collided: bool = False
     mission_active: bool = True
     """The mission was under way when the step began."""
+    encountered: bool = False
+    """Ego task avoidance: the robots met."""
+    arrived: bool = False
+    """Ego task avoidance: the ego is in its goal."""
+    watched: bool = False
+    """Ego task surveillance: the ego watches the adversary at the end of the step."""
 
 
 def ego_reward(events: Events, motion: Motion, scenario: Scenario, seconds: float) -> float:
-    """The paper's reward (section 5) over a control step of so many seconds."""
+    """The ego's reward (the paper's, section 5, in interception) over a control step of so many seconds."""
     prices = scenario.rewards
     reward = (prices.per_step + prices.control * (motion.v**2 + motion.w**2)) * seconds / scenario.step_seconds
     if events.intercepted:
         reward += prices.interception
     if events.ego_collided:
         reward += prices.collision
-    if events.completed:
-        reward += prices.mission_completed
+    if scenario.ego_task == "interception":
+        if events.completed:
+            reward += prices.mission_completed
+    elif events.encountered:
+        reward += prices.encounter
+    elif events.arrived:
+        reward += prices.arrival
+    elif events.watched:
+        reward += prices.watched * seconds
     return reward
 
 

@@ -60,4 +60,21 @@ def reef() -> Scenario:
     )
 
 
-PRESETS: dict[str, Callable[[], Scenario]] = {"lab": lab, "paper": paper, "open": open_field, "reef": reef}
+def lab_avoidance() -> Scenario:
+    """`lab` with an ego that must cross to the lower left corner without meeting the adversary."""
+    return replace(lab(), name="lab-avoidance", ego_task="avoidance", ego_goal=Disc(0.35, 0.35, 0.2))
+
+
+def lab_surveillance() -> Scenario:
+    """`lab` with an ego that is paid for every second during which it watches the adversary."""
+    return replace(lab(), name="lab-surveillance", ego_task="surveillance")
+
+
+PRESETS: dict[str, Callable[[], Scenario]] = {
+    "lab": lab,
+    "paper": paper,
+    "open": open_field,
+    "reef": reef,
+    "lab-avoidance": lab_avoidance,
+    "lab-surveillance": lab_surveillance,
+}

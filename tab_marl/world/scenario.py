@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
-from dataclasses import dataclass, field
-from typing import ClassVar
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 
 from tab_marl.world.regions import Box, Disc, Region
 
 STRICT: dict[str, str] = {"extra": "forbid"}
+
+EgoTask = Literal["interception", "avoidance", "surveillance"]
+"""What the ego is paid for (paper, section 2): to meet the adversary; to get to a goal without meeting it; to watch it."""
+EGO_TASKS: tuple[EgoTask, ...] = get_args(EgoTask)
 
 
 class UnknownName(KeyError):
@@ -75,16 +79,26 @@ class Checkpoint:
 
 @dataclass(frozen=True)
 class Rewards:
-    """The ego's reward (paper, section 5), plus the price of a completed mission."""
+    """The ego's reward (paper, section 5), plus the price of a completed mission and those of the other ego tasks.
+
+    `collision`, `per_step` and `control` count in every ego task, the others in the one they name.
+    """
 
     interception: float = 50.0
+    """Interception: once, when the centres are within `Scenario.interception_metres`."""
     collision: float = -30.0
     per_step: float = -1.0
     """Per time step of `Scenario.step_seconds`."""
     control: float = -0.1
     """Times v^2 + w^2, per time step."""
     mission_completed: float = -50.0
-    """Paid once when the adversary completes its mission first; 0 in the paper."""
+    """Interception: paid once when the adversary completes its mission first; 0 in the paper."""
+    encounter: float = -50.0
+    """Avoidance: once, when the centres are within `Scenario.interception_metres`; ends the episode."""
+    arrival: float = 50.0
+    """Avoidance: once, when the ego's centre is inside `Scenario.ego_goal`; ends the episode."""
+    watched: float = 1.0
+    """Surveillance: per second during which the ego watches the adversary (`Scenario.watch_metres`)."""
 
     __pydantic_config__: ClassVar = STRICT
 
@@ -151,13 +165,21 @@ class Scenario:
     exact_fraction: float = 0.1
     central_zone_metres: float = 0.4
     """Radius of the central zone."""
+    ego_task: EgoTask = "interception"
+    """What the ego is paid for, through the reward alone (`Rewards`). An encounter ends interception and avoidance; arrival
+    ends avoidance; surveillance runs to the horizon."""
+    ego_goal: Region | None = None
+    """Avoidance: where the ego must get; None in the other tasks."""
+    watch_metres: float = 0.8
+    """Surveillance: the ego watches the adversary, and therefore sees it, while their centres are within this distance
+    with a free line of sight."""
 
     __pydantic_config__: ClassVar = STRICT
 
     def __post_init__(self) -> None:
         for name in (
             "width_metres", "height_metres", "interception_metres", "physics_hertz", "control_hertz", "decision_hertz",
-            "step_seconds", "horizon_seconds", "target_radius_metres", "leave_metres", "central_zone_metres",
+            "step_seconds", "horizon_seconds", "target_radius_metres", "leave_metres", "central_zone_metres", "watch_metres",
         ):  # fmt: skip
             require_positive(self, name)
         if self.physics_hertz % self.control_hertz or self.control_hertz % self.decision_hertz:
@@ -185,6 +207,24 @@ class Scenario:
                     f"Scenario {self.name!r}: {checkpoint.name} at ({checkpoint.x}, {checkpoint.y}) lies outside the "
                     f"{self.width_metres} x {self.height_metres} m arena"
                 )
+        self._check_ego_task()
+
+    def _check_ego_task(self) -> None:
+        if self.ego_task not in EGO_TASKS:
+            raise UnknownName("ego task", str(self.ego_task), EGO_TASKS)
+        if (self.ego_task == "avoidance") != (self.ego_goal is not None):
+            remedy = "give the region that it must reach" if self.ego_goal is None else "only avoidance has a goal"
+            raise ValueError(
+                f"Scenario {self.name!r}: ego_task is {self.ego_task!r} and ego_goal is {self.ego_goal}: {remedy}, "
+                "or use Scenario.for_task"
+            )
+        if self.ego_goal is not None:
+            x, y = self.ego_goal.centre
+            if not (0 <= x <= self.width_metres and 0 <= y <= self.height_metres):
+                raise ValueError(
+                    f"Scenario {self.name!r}: the centre of ego_goal ({x:g}, {y:g}) lies outside the "
+                    f"{self.width_metres} x {self.height_metres} m arena"
+                )
 
     @classmethod
     def preset(cls, name: str) -> Scenario:
@@ -194,6 +234,20 @@ class Scenario:
         if name not in PRESETS:
             raise UnknownName("scenario", name, PRESETS)
         return PRESETS[name]()
+
+    def for_task(
+        self, ego_task: EgoTask, ego_goal: Region | None = None, watch_metres: float | None = None
+    ) -> Scenario:
+        """This scenario with another task for the ego. Avoidance without a goal gets `ego_tasks.far_goal`.
+
+        Raises UnknownName for a task that does not exist, ValueError for a goal that does not belong to the task.
+        """
+        if ego_task == "avoidance" and ego_goal is None:
+            from tab_marl.world.ego_tasks import far_goal
+
+            ego_goal = self.ego_goal or far_goal(self)
+        watch = self.watch_metres if watch_metres is None else watch_metres
+        return replace(self, ego_task=ego_task, ego_goal=ego_goal, watch_metres=watch)
 
     @property
     def horizon_ticks(self) -> int:
