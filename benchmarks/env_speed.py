@@ -1,9 +1,11 @@
-"""Steps per second of the interception environment beside a bare pymunk loop, in one run on one core.
+"""Steps per second of the interception environment beside MPE2's simple_tag and a bare pymunk loop, in one run on one core.
 
-The bare loop has the same walls and obstacles and two bodies that drive the same circles, their velocities assigned once
+simple_tag plays 1 against 1 with two obstacles, random actions, through its parallel API. The bare loop has the same walls and obstacles and two bodies that drive the same circles, their velocities assigned once
 per environment step, and does nothing else but ten `Space.step`s: what pymunk leaves to any environment at this rate.
 
-Run: python benchmarks/env_speed.py
+Both of the environment's agents act and observe at every step (0.1 s, ten physics substeps); the ego without lidar.
+
+Run: OMP_NUM_THREADS=1 python benchmarks/env_speed.py      (pip install -e '.[benchmarks]' for MPE2)
 """
 
 from __future__ import annotations
@@ -16,6 +18,9 @@ from dataclasses import replace
 
 import numpy as np
 import pymunk
+from mpe2 import simple_tag_v3
+from rich.console import Console
+from rich.table import Table
 
 from tab_marl.envs.intercept import InterceptEnv
 from tab_marl.envs.single_agent import ego_env
@@ -70,6 +75,20 @@ def bare_pymunk(scenario: Scenario) -> Step:
     return step
 
 
+def simple_tag() -> Step:
+    env = simple_tag_v3.parallel_env(num_good=1, num_adversaries=1, num_obstacles=2, max_cycles=STEPS)
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    actions = [{agent: int(rng.integers(5)) for agent in env.possible_agents} for _ in range(STEPS)]
+
+    def step(i: int) -> None:
+        env.step(actions[i])
+        if not env.agents:
+            env.reset()
+
+    return step
+
+
 def parallel(scenario: Scenario, actions: np.ndarray, mission: str = "M1") -> Step:
     """Both agents act; `actions` ``[STEPS, 2, 2]``."""
     env = InterceptEnv(mission=mission, scenario=scenario)
@@ -106,6 +125,7 @@ def main() -> None:
     found = rates(
         {
             "bare pymunk loop": lambda: bare_pymunk(plain),
+            "MPE2 simple_tag, 1 against 1": simple_tag,
             "parallel env": lambda: parallel(plain, circles),
             "parallel env, mission M5": lambda: parallel(plain, circles, "M5"),
             "parallel env, random actions": lambda: parallel(plain, random),
@@ -113,10 +133,11 @@ def main() -> None:
             "Gymnasium view, scripted adversary": lambda: single_agent(plain),
         }
     )
-    base = found["bare pymunk loop"]
-    print(f"{'':36}{'steps/s':>10}{'of bare':>10}")
+    bare, peer = found["bare pymunk loop"], found["MPE2 simple_tag, 1 against 1"]
+    table = Table("", "steps/s", "times simple_tag", "times the bare loop's cost")
     for name, steps in found.items():
-        print(f"{name:36}{steps:10,.0f}{steps / base:10.2f}")
+        table.add_row(name, f"{steps:,.0f}", f"{steps / peer:.2f}", f"{bare / steps:.2f}")
+    Console().print(table)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Compiled loops of the adversary's side: labels of points, what a policy observes, and a step of the batched world.
+"""Compiled loops of the adversary's side: labels of points, missions, and what a policy observes.
 
 Arrays and scalars only; nothing here validates or raises. `bank` is `adversary_tables.Tables`: many tasks packed into
 flat arrays, a row of offsets each. Column numbers of those rows are the constants below.
@@ -15,14 +15,13 @@ from numba import njit
 from tab_marl.envs.lidar_kernels import free_distance
 from tab_marl.mission.kernels import advance
 from tab_marl.mission.route_kernels import look_ahead
-from tab_marl.world.kernels import unicycle_step
 
 # Columns of Tables.number.
 LOCATIONS, LABELS, PROPOSITIONS, CELLS, ROWS, COLUMNS = 0, 1, 2, 3, 4, 5
 GRID_AT, CENTRES_AT, TABLE_AT, LOCATION_AT, REGION_AT, OBSTACLES = 6, 7, 8, 9, 10, 11
 DISC_AT, DISCS, EDGE_AT, EDGES, HORIZON_TICKS, INITIAL = 12, 13, 14, 15, 16, 17
-VIAS, VIA_HOME, FORBIDS_AT = 18, 19, 20
-NUMBERS = 21
+VIAS, VIA_HOME, FORBIDS_AT, SUBSTEPS = 18, 19, 20, 21
+NUMBERS = 22
 # Columns of Tables.field, one row for the plain route and one for the styled one.
 SYMBOL_AT, FIELD_LOCATIONS, FIELD_LABELS, FIELD_TABLE_AT, COST_AT, DISTANCE_AT = 0, 1, 2, 3, 4, 5
 FIELD_NUMBERS = 6
@@ -299,50 +298,3 @@ def _observe_zone(bank, k, location, x, y, cos, sin, out):
         away = max(math.hypot(cx - x, cy - y), 1e-9)
         out[O_ZONE] = ((cx - x) * cos + (cy - y) * sin) / away
         out[O_ZONE + 1] = ((cy - y) * cos - (cx - x) * sin) / away
-
-
-@njit(cache=True)
-def move(bank, k, x, y, theta, v, w):
-    """A unicycle's exact motion for one tick, pushed out of walls and obstacles. Returns (x, y, theta, touched)."""
-    number, real = bank.number[k], bank.real[k]
-    x, y, theta = unicycle_step(x, y, theta, v, w, real[TICK_SECONDS])
-    radius = real[RADIUS]
-    touched = False
-    for _ in range(2):
-        for i in range(number[OBSTACLES]):
-            region = number[REGION_AT] + number[PROPOSITIONS] + i
-            nx, ny, gap = _outward(bank.disc, bank.region_first, bank.halfplanes, bank.corners, region, x, y)
-            if gap < radius:
-                x += (radius - gap) * nx
-                y += (radius - gap) * ny
-                touched = True
-        inner_x = min(max(x, radius), real[WIDTH] - radius)
-        inner_y = min(max(y, radius), real[HEIGHT] - radius)
-        if inner_x != x or inner_y != y:
-            touched = True
-            x, y = inner_x, inner_y
-    return x, y, theta, touched
-
-
-@njit(cache=True)
-def _outward(disc, first, halfplanes, corners, region, x, y):
-    """Unit vector away from a region's nearest boundary point, and the signed distance to it."""
-    if disc[region, 0] > 0.0:
-        dx, dy = x - disc[region, 1], y - disc[region, 2]
-        far = max(math.hypot(dx, dy), 1e-9)
-        return dx / far, dy / far, far - disc[region, 3]
-    best, side = -np.inf, first[region]
-    for i in range(first[region], first[region + 1]):
-        gap = halfplanes[i, 0] * x + halfplanes[i, 1] * y - halfplanes[i, 2]
-        if gap > best:
-            best, side = gap, i
-    if best > 0.0:
-        # Outside: beyond a corner of the nearest side the corner itself is the nearest point.
-        ax, ay, bx, by = corners[side, 0], corners[side, 1], corners[side, 2], corners[side, 3]
-        ex, ey = bx - ax, by - ay
-        along = ((x - ax) * ex + (y - ay) * ey) / (ex * ex + ey * ey)
-        if along < 0.0 or along > 1.0:
-            cx, cy = (ax, ay) if along < 0.0 else (bx, by)
-            far = max(math.hypot(x - cx, y - cy), 1e-9)
-            return (x - cx) / far, (y - cy) / far, far
-    return halfplanes[side, 0], halfplanes[side, 1], best

@@ -57,6 +57,8 @@ class Tables(NamedTuple):
     halfplanes: NDArray[np.float64]
     corners: NDArray[np.float64]
     region_centre: NDArray[np.float64]
+    region_reach: NDArray[np.float64]
+    """No point of the region is farther than this from its centre, metres."""
     ray_discs: NDArray[np.float64]
     ray_edges: NDArray[np.float64]
 
@@ -147,7 +149,7 @@ _ROWS: dict[str, tuple[type, tuple[int, ...]]] = {
     "centres": (np.float64, (2,)), "cost": (np.float32, (16,)), "resets": (np.bool_, (3,)),
     "earliest": (np.int32, (3,)), "latest": (np.int32, (3,)), "window": (np.int32, (2,)),
     "disc": (np.float64, (4,)), "halfplanes": (np.float64, (3,)), "corners": (np.float64, (4,)),
-    "region_centre": (np.float64, (2,)), "ray_discs": (np.float64, (3,)), "ray_edges": (np.float64, (4,)),
+    "region_centre": (np.float64, (2,)), "region_reach": (np.float64, ()), "ray_discs": (np.float64, (3,)), "ray_edges": (np.float64, (4,)),
     "distance": (np.float32, ()), "length": (np.float32, ()), "to_visit": (np.float32, ()),
     "progress": (np.bool_, ()), "patient": (np.bool_, ()), "forbids": (np.bool_, ()),
     "speed_limit": (np.float64, ()),
@@ -208,10 +210,12 @@ def _pack_map(part: Parts, pools: dict[str, _Pool], number: NDArray[np.int64], f
     regions: list[Region] = [*part.automaton.regions, *scenario.obstacles]
     number[k.REGION_AT] = len(first) - 1
     number[k.OBSTACLES] = len(scenario.obstacles)
+    number[k.SUBSTEPS] = scenario.physics_hertz // scenario.control_hertz
     for region in regions:
         disc, planes, corners = _outline(region)
         pools["disc"].add(disc, 1, disc)
         pools["region_centre"].add(np.array(region.centre), 1, disc)
+        pools["region_reach"].add(np.array([_reach(region)]), 1, disc)
         pools["halfplanes"].add(planes, len(planes), disc)
         pools["corners"].add(corners, len(corners), disc)
         first.append(first[-1] + len(planes))
@@ -244,3 +248,9 @@ def _outline(region: Region) -> tuple[NDArray[np.float64], NDArray[np.float64], 
     edge = b - a
     normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.hypot(edge[:, 0], edge[:, 1])[:, None]
     return np.zeros(4), np.column_stack([normal, (normal * a).sum(axis=1)]), np.hstack([a, b])
+
+
+def _reach(region: Region) -> float:
+    if isinstance(region, Disc):
+        return region.radius
+    return float(np.hypot(*(region.vertices() - region.centre).T).max())

@@ -15,10 +15,13 @@ from tab_marl.envs.adversary_kernels import (
     LOCATION_AT,
     MAX_SPEED,
     MAX_TURN,
-    move,
+    RADIUS,
+    SUBSTEPS,
+    TICK_SECONDS,
     observe,
     task_advance,
 )
+from tab_marl.envs.motion_kernels import drive
 
 COMPLETED, FAILED = -1, -2
 
@@ -73,7 +76,10 @@ def step_many(
         pace = min(real[MAX_SPEED], bank.speed_limit[bank.number[k, LOCATION_AT] + location[i]])
         v = min(0.5 * (min(max(action[i, 0], -1.0), 1.0) + 1.0) * real[MAX_SPEED], pace)
         w = min(max(action[i, 1], -1.0), 1.0) * real[MAX_TURN]
-        x, y, theta, hit = move(bank, k, state[i, 0], state[i, 1], state[i, 2], v, w)
+        substeps = bank.number[k, SUBSTEPS]
+        x, y, theta, v, hit = drive(
+            bank, k, state[i, 0], state[i, 1], state[i, 2], v, w, real[RADIUS], real[TICK_SECONDS] / substeps, substeps
+        )
         state[i, 0], state[i, 1], state[i, 2], state[i, 3], state[i, 4] = x, y, theta, v, w
         touched[i] = hit
         before, dropped = location[i], memory[i, 1]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tab_marl.envs import adversary_kernels as k
+from tab_marl.envs import motion_kernels as motion
 from tab_marl.envs.adversary_observation import OBSERVED, AdversaryObserver, AdversaryTask, observation_bounds
 from tab_marl.envs.adversary_tables import later_windows, pack
 from tab_marl.envs.lidar import Lidar
@@ -214,7 +215,7 @@ def test_region_distances_and_motion_against_the_world():
         assert ((signed <= 1e-12) == (exact == 0)).all()
         assert (signed <= exact + 1e-9).all()
         outward = [
-            k._outward(tables.disc, tables.region_first, tables.halfplanes, tables.corners, start + i, *p)
+            motion.outward(tables.disc, tables.region_first, tables.halfplanes, tables.corners, start + i, *p)
             for p in points
         ]
         outside = exact > 0
@@ -224,7 +225,7 @@ def test_region_distances_and_motion_against_the_world():
     free = points[free_points(scenario, points, radius)]
     for x, y in free[:500]:
         theta, v, w = rng.uniform(-3, 3), rng.uniform(0, 0.22), rng.uniform(-1.8, 1.8)
-        nx, ny, turned, touched = k.move(tables, 0, x, y, theta, v, w)
+        nx, ny, turned, _, touched = motion.drive(tables, 0, x, y, theta, v, w, radius, 0.01, 10)
         assert free_points(scenario, np.array([[nx, ny]]), radius - 2e-3)[0]
         if not touched:
             fine = np.array([x, y, theta])

@@ -8,6 +8,7 @@ import pytest
 from tab_marl.envs import adversary_kernels as k
 from tab_marl.envs.adversary_observation import AdversaryObserver, AdversaryTask
 from tab_marl.envs.batched import Bank, BatchedWorld, Prices, draw_start
+from tab_marl.envs.motion_kernels import drive
 from tab_marl.envs.styles import STYLES
 from tab_marl.mission.tasks import sample_task
 from tab_marl.world.grid import free_points
@@ -59,7 +60,7 @@ def test_a_step_equals_one_robot_at_a_time(bank):
                 continue
             a = np.clip(action[i].astype(np.float64), -1, 1)
             v, w = (a[0] + 1) / 2 * 0.22, a[1] * 1.82
-            *pose[i], hit = k.move(task.tables, 0, *pose[i], v, w)
+            *pose[i], v, hit = drive(task.tables, 0, *pose[i], v, w, 0.105, 0.01, 10)
             before, automaton = states[i], task.automaton
             mask = int(automaton.masks(pose[i, :2])[0])
             after = automaton.advance(before, mask)
