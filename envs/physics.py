@@ -1,4 +1,4 @@
-"""The pymunk world of one episode: walls, obstacles and two differential-drive robots, stepped at `Scenario.physics_hertz`.
+"""The pymunk world of one episode: walls, obstacles and differential-drive robots, stepped at `Scenario.physics_hertz`.
 
 How a robot is driven. Its body is tied by a pivot joint and a gear joint to a kinematic "wheel" body that turns at the
 commanded rate w; the pivot's anchor on the wheel lies at the instantaneous centre of rotation, so the anchor runs along
@@ -7,12 +7,17 @@ happens inside Chipmunk: one set of Python calls per control step instead of one
 equals the exact unicycle arc to rounding (the anchor is set half a substep ahead, so that each substep moves along the
 chord); against a wall the robot slides without friction and sinks in by a millimetre or two for one substep.
 
-A Space keeps a hidden contact cache, so its state cannot be restored exactly: every episode builds a fresh Arena.
+A Space keeps a hidden contact cache (impulses of the contacts of the last substep, pairs that touch, the order of its
+search tree), so positions and velocities alone do not restore it: a copy made from them drifts by a millimetre as soon as
+there is contact. An Arena therefore remembers its commands, and a copy (`copy.deepcopy`, `pickle`) is a fresh Arena that is
+driven through them again: exact to the last bit, at the cost of replaying the episode so far (about 30 us per control step).
+Every episode builds a fresh Arena.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import pymunk
@@ -25,7 +30,7 @@ Start = tuple[float, float, float]
 """x [m], y [m], theta [rad]."""
 
 EGO, ADVERSARY = 0, 1
-"""Index of each robot in an Arena."""
+"""Index of each robot in an Arena of one against one."""
 
 WALL_METRES = 0.5
 """Walls are thick, outside the arena, so that nothing passes them."""
@@ -36,7 +41,8 @@ MOTOR_STRENGTH = 4.0
 STRAIGHT_TURN_RATE = 1e-6
 """rad/s; slower turns count as straight, to keep the turning circle's radius finite."""
 
-_ROBOT_TYPES, _SOLID_TYPE = (1, 2), 3
+_SOLID_TYPE = 1000
+"""Collision type of walls and obstacles; a robot's is its index."""
 
 
 def _accessors(owner: type, name: str) -> tuple[Any, Any]:
@@ -68,12 +74,16 @@ class Motion(NamedTuple):
 
 
 class Arena:
-    """The bodies of one episode. Robots are EGO and ADVERSARY; commands hold until the next `command`."""
+    """The bodies of one episode: egos first, then adversaries. Commands hold until the next `command`."""
 
-    def __init__(self, scenario: Scenario, starts: tuple[Start, Start]) -> None:
-        """`starts` of the ego and of the adversary."""
+    def __init__(self, scenario: Scenario, starts: Sequence[Start], egos: int = 1) -> None:
+        """`starts` of all robots, the first `egos` of them the egos'."""
+        self._given = (scenario, tuple(starts), egos)
+        self._log: list[tuple[int, tuple[tuple[float, float], ...] | int]] = []
+        """(substeps run before, commands of all robots), or (substeps, index of a robot that was removed)."""
+        self._substeps = 0
         self.substep_seconds = 1.0 / scenario.physics_hertz
-        self.touching = [False, False]
+        self.touching = [False] * len(starts)
         """Whether each robot touched a wall or an obstacle since the last `command`."""
         self._space = Space()
         self._space.collision_slop = SLOP_METRES
@@ -82,18 +92,36 @@ class Arena:
             shape.friction = 0.0
             self._space.add(shape)
         self._drives = [
-            _Drive(self._space, robot, pose, self.substep_seconds, kind)
-            for robot, pose, kind in zip((scenario.ego, scenario.adversary), starts, _ROBOT_TYPES, strict=True)
+            _Drive(self._space, scenario.ego if i < egos else scenario.adversary, pose, self.substep_seconds, i)
+            for i, pose in enumerate(starts)
         ]
-        self._contacts = [0, 0]
-        self._pressed = False
-        """Whether the robots touch each other; impossible where they intercept from farther away."""
-        for robot in (EGO, ADVERSARY):
+        self._driven = list(enumerate(self._drives))
+        self._contacts = [0] * len(starts)
+        self._pressed = [0] * len(starts)
+        """How many other robots each robot touches; none where they intercept from farther away."""
+        for robot in range(len(starts)):
             self._space.on_collision(
-                _ROBOT_TYPES[robot], _SOLID_TYPE, begin=self._on_begin, separate=self._on_separate, data=robot
-            )
-        self._space.on_collision(*_ROBOT_TYPES, begin=self._on_meeting, separate=self._on_parting)
+                robot, _SOLID_TYPE, begin=self._on_begin, separate=self._on_separate, data=robot
+            )  # fmt: skip
+            for other in range(robot + 1, len(starts)):
+                self._space.on_collision(
+                    robot, other, begin=self._on_meeting, separate=self._on_parting, data=(robot, other)
+                )
         self._step = self._space.step
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"given": self._given, "log": list(self._log), "substeps": self._substeps}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """A fresh Arena, driven through the same commands."""
+        self.__init__(*state["given"])  # type: ignore[misc]
+        for before, entry in state["log"]:
+            self.run(before - self._substeps)
+            if isinstance(entry, int):
+                self.remove(entry)
+            else:
+                self.command(*entry)
+        self.run(state["substeps"] - self._substeps)
 
     def _on_begin(self, arbiter: pymunk.Arbiter, space: Space, robot: Any) -> None:
         self._contacts[robot] += 1
@@ -102,33 +130,49 @@ class Arena:
     def _on_separate(self, arbiter: pymunk.Arbiter, space: Space, robot: Any) -> None:
         self._contacts[robot] -= 1
 
-    def _on_meeting(self, arbiter: pymunk.Arbiter, space: Space, data: object) -> None:
-        self._pressed = True
+    def _on_meeting(self, arbiter: pymunk.Arbiter, space: Space, pair: Any) -> None:
+        for robot in pair:
+            self._pressed[robot] += 1
 
-    def _on_parting(self, arbiter: pymunk.Arbiter, space: Space, data: object) -> None:
-        self._pressed = False
+    def _on_parting(self, arbiter: pymunk.Arbiter, space: Space, pair: Any) -> None:
+        for robot in pair:
+            self._pressed[robot] -= 1
 
-    def command(self, ego: tuple[float, float], adversary: tuple[float, float]) -> None:
-        """Command (speed [m/s], turn rate [rad/s]) of both robots; call before a run of substeps."""
-        self._drives[EGO].command(*ego, self._pressed or self.touching[EGO])
-        self._drives[ADVERSARY].command(*adversary, self._pressed or self.touching[ADVERSARY])
-        self.touching[EGO] = self._contacts[EGO] > 0
-        self.touching[ADVERSARY] = self._contacts[ADVERSARY] > 0
+    def command(self, *commands: tuple[float, float]) -> None:
+        """Command (speed [m/s], turn rate [rad/s]) of every robot, in order; call before a run of substeps.
+
+        The commands of robots that were removed are not looked at.
+        """
+        self._log.append((self._substeps, commands))
+        touching, contacts, pressed = self.touching, self._contacts, self._pressed
+        for i, drive in self._driven:
+            v, w = commands[i]
+            drive.command(v, w, touching[i] or pressed[i] > 0)
+            touching[i] = contacts[i] > 0
+
+    def remove(self, robot: int) -> None:
+        """Take a robot out of the arena; its `motion` stays what it was, at rest."""
+        self._log.append((self._substeps, robot))
+        self._driven = [(i, drive) for i, drive in self._driven if i != robot]
+        self._drives[robot].remove(self._space)
+        self.touching[robot] = False
 
     def substep(self) -> None:
         """Advance by one physics substep."""
+        self._substeps += 1
         self._step(self.substep_seconds)
 
     def run(self, substeps: int) -> None:
         """Advance by so many physics substeps."""
         step, seconds = self._step, self.substep_seconds
+        self._substeps += substeps
         for _ in range(substeps):
             step(seconds)
 
-    def squared_gap(self) -> float:
-        """Squared distance between the robots' centres, square metres."""
-        x, y = _get_position(self._drives[0].body)
-        other_x, other_y = _get_position(self._drives[1].body)
+    def squared_gap(self, robot: int = EGO, other: int = ADVERSARY) -> float:
+        """Squared distance between two robots' centres, square metres."""
+        x, y = _get_position(self._drives[robot].body)
+        other_x, other_y = _get_position(self._drives[other].body)
         return float((x - other_x) ** 2 + (y - other_y) ** 2)
 
     def motion(self, robot: int) -> Motion:
@@ -146,7 +190,7 @@ class Arena:
 class _Drive:
     """One robot: its body, the wheel that leads it and the two joints between them."""
 
-    __slots__ = ("_pivot", "_substep_seconds", "_wheel", "body", "v", "w")
+    __slots__ = ("_parts", "_pivot", "_substep_seconds", "_wheel", "body", "v", "w")
 
     def __init__(self, space: Space, robot: Robot, pose: Start, substep_seconds: float, kind: int) -> None:
         mass, radius = robot.mass_kilograms, robot.radius_metres
@@ -166,7 +210,13 @@ class _Drive:
         self._pivot.max_bias = gear.max_bias = 0.0
         self._pivot.max_force = MOTOR_STRENGTH * mass * robot.max_speed / substep_seconds
         gear.max_force = MOTOR_STRENGTH * self.body.moment * robot.max_turn_rate / substep_seconds
-        space.add(self.body, hull, self._wheel, self._pivot, gear)
+        self._parts = (self.body, hull, self._wheel, self._pivot, gear)
+        space.add(*self._parts)
+
+    def remove(self, space: Space) -> None:
+        """Leave the space, and stand still."""
+        space.remove(*self._parts)
+        self.v = self.w = 0.0
 
     def command(self, v: float, w: float, touching: bool) -> None:
         self.v, self.w = v, w
