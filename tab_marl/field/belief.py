@@ -245,7 +245,7 @@ class ProductBelief:
     @property
     def completed(self) -> float:
         """Probability that the mission is complete."""
-        return float(self.masses[self.automaton_states == self.chain.accepting].sum())
+        return float(self.masses[self.chain.complete[self.automaton_states]].sum())
 
 
 def _position_kernel(squared_metres: NDArray[np.float64], deviation: float) -> NDArray[np.float64]:
@@ -255,5 +255,5 @@ def _position_kernel(squared_metres: NDArray[np.float64], deviation: float) -> N
 
 def disc_cover(chain: ProductChain, centre: ArrayLike, radius_metres: float) -> NDArray[np.float64]:
     """``[C]``: about how much of each cell a disc covers, 0 to 1, from the distance of the cell's centre to its edge."""
-    away = np.hypot(*(chain.centres - np.asarray(centre, dtype=np.float64)).T)
+    away = np.linalg.norm(chain.centres - np.asarray(centre, dtype=np.float64), axis=1)
     return np.clip((radius_metres - away) / chain.cell_metres + 0.5, 0.0, 1.0)

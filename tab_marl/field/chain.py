@@ -68,10 +68,12 @@ class ProductChain(NamedTuple):
     mode_shares: NDArray[np.float64]
     """``[M]`` distribution of the first mode, before it is tilted by h."""
     centres: NDArray[np.float64]
-    """``[C, 2]`` metres."""
+    """``[C, 2]`` metres, in space ``[C, 3]``."""
     cell_metres: float
     headings: NDArray[np.float64]
     """``[M]`` radians, nan for rest."""
+    complete: NDArray[np.bool_]
+    """``[Q]`` whether the mission is complete (in `accepting`, and where only other events are still watched)."""
 
     @property
     def cells(self) -> int:
@@ -100,6 +102,7 @@ def product_chain(
     weight: ArrayLike | None = None,
     log_scale: ArrayLike | None = None,
     harmonic: bool = False,
+    complete: ArrayLike | None = None,
 ) -> ProductChain:
     """A chain from any reference and any table h >= 0.
 
@@ -110,11 +113,12 @@ def product_chain(
         automaton: anything with delta ``[Q, L]``, initial, accepting and rejecting; cycles are allowed.
         start: ``[C]`` distribution of the first cell.
         value: ``[Q, S]`` h; default 1 everywhere. Rows of absorbing states matter as targets only.
-        centres: ``[C, 2]`` metres; default: cells one apart on a line.
+        centres: ``[C, 2]`` metres, in space ``[C, 3]``; default: cells one apart on a line.
         reference_of: ``[Q]`` reference of each automaton state; default 0.
         weight: ``[Q, L]`` factor on each transition; default 1.
         log_scale: ``[Q]``, if `value` holds h / exp(log_scale).
         harmonic: `value` is known to satisfy ``h = sum Q w h'`` on transient states, so that it is its own normaliser.
+        complete: ``[Q]`` where the mission counts as complete; default: in `accepting` alone.
     Raises:
         ValueError: a field has the wrong shape, a negative or not finite entry, or rows that sum to more than 1.
     """
@@ -155,8 +159,8 @@ def product_chain(
         np.stack([np.arange(cells) + 0.5, np.full(cells, 0.5)], axis=1) if centres is None else centres,
         dtype=np.float64,
     )
-    if places.shape != (cells, 2):
-        raise ValueError(f"centres has shape {places.shape}, must be [{cells}, 2]")
+    if places.shape not in ((cells, 2), (cells, 3)):
+        raise ValueError(f"centres has shape {places.shape}, must be [{cells}, 2], in space [{cells}, 3]")
     scale = np.zeros(count) if log_scale is None else np.array(log_scale, dtype=np.float64)
     transient = np.setdiff1d(np.arange(count), [automaton.accepting, automaton.rejecting]).astype(np.int32)
     if harmonic:
@@ -185,6 +189,7 @@ def product_chain(
         np.ascontiguousarray(places),
         float(cell_metres),
         reference.headings,
+        np.arange(count) == automaton.accepting if complete is None else np.array(complete, dtype=np.bool_),
     )
 
 

@@ -11,13 +11,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
-from tab_marl.field import reference as references
+from tab_marl.field import processes
 from tab_marl.field.chain import check_nonnegative
 from tab_marl.field.reference import Reference, from_matrices
+from tab_marl.field.stages import stages_of
 from tab_marl.world.grid import GridMap
 from tab_marl.world.scenario import Scenario, UnknownName
+from tab_marl.world.volume import Volume
+from tab_marl.world.voxels import VoxelMap
 
 if TYPE_CHECKING:
+    from tab_marl.field.events import SoftConstraint, TimingPrior
+    from tab_marl.field.tracking import Tracking
     from tab_marl.mission.automaton import MissionAutomaton
     from tab_marl.mission.model import Mission
     from tab_marl.mission.unroll import TickAutomaton
@@ -26,6 +31,8 @@ Transitions = Reference | sparse.sparray | sparse.spmatrix | NDArray[np.float64]
 
 CELL_SIZES_METRES = (0.05, 0.1)
 """Tried in this order when `FieldOptions.cell_metres` is None."""
+UNDER_WAY, COMPLETE, FAILED = 0, 1, 2
+"""How a mission stands: values of `FieldProblem.status`."""
 ROUGH_CELL_METRES = 0.15
 ROUGH_FROM = 1_500_000
 """Automaton states x base states from which a first fit on rough cells saves time."""
@@ -56,7 +63,9 @@ class FieldOptions:
     state_budget: int = 8_000_000
     """Automaton states x cells x modes up to which finer cells are preferred."""
     marginal_tolerance: float = 0.05
-    """Relative error at which goal marginals, timing prior and completion probability are met."""
+    """Relative error at which goal marginals, timing priors and completion probability are met."""
+    constraint_tolerance: float = 1e-4
+    """Error of a probability at which a soft constraint is met."""
     max_iterations: int = 60
     """Of the fit of their weights."""
     least_share: float = 1e-9
@@ -70,7 +79,7 @@ class FieldOptions:
         ):
             if getattr(self, name) not in known:
                 raise UnknownName(f"FieldOptions.{name}", str(getattr(self, name)), known)
-        for name in ("cell_metres", "mean_run_metres", "marginal_tolerance", "state_budget"):
+        for name in ("cell_metres", "mean_run_metres", "marginal_tolerance", "constraint_tolerance", "state_budget"):
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise ValueError(f"FieldOptions.{name} is {value}, must be > 0")
@@ -108,17 +117,29 @@ class FieldProblem:
     """``[C]`` distribution of the first cell."""
     horizon: int
     """Ticks shown by `TabField.occupancy` and sampled by default."""
-    options: FieldOptions = field(default_factory=lambda: FieldOptions(precision="double", marginal_tolerance=1e-10))
+    options: FieldOptions = field(default_factory=lambda: FieldOptions(precision="double", marginal_tolerance=1e-10, constraint_tolerance=1e-10)
+    )
     reference_of: ArrayLike | None = None
     """``[Q]`` which of several references holds in each automaton state."""
-    grid: GridMap | None = None
-    scenario: Scenario | None = None
+    grid: GridMap | VoxelMap | None = None
+    """Where the cells lie; None: one metre apart on a line."""
+    scenario: Scenario | Volume | None = None
     branch_places: tuple[str, ...] = ()
     """Names of the automaton's branches, for people."""
     earliest_tick: ArrayLike = 0
     """``[C]`` or one number: no completion before this tick, from this start cell, is feasible for the timing prior."""
     rough: FieldProblem | None = None
     """The same on coarser cells, on which the weights of goal marginals are fitted first; None to do without."""
+    stage: ArrayLike | None = None
+    """``[Q]`` stages of the mission completed in each automaton state; default: one stage, completed by acceptance."""
+    stage_names: tuple[str, ...] = ("mission",)
+    status: ArrayLike | None = None
+    """``[Q]`` UNDER_WAY, COMPLETE or FAILED: how the mission stands; default: by the absorbing states."""
+    mission: Mission | None = None
+    constraints: tuple[SoftConstraint | TimingPrior, ...] = ()
+    """Set by `constrained`."""
+    tracking: Tracking | None = None
+    """Which other events the automaton watches; set by `constrained` and `TabField.track`."""
 
     def __post_init__(self) -> None:
         motion = self.transitions if isinstance(self.transitions, Reference) else from_matrices(self.transitions)
@@ -156,21 +177,60 @@ class FieldProblem:
         object.__setattr__(self, "labels", labels)
         object.__setattr__(self, "start", start)
         object.__setattr__(self, "reference_of", which.astype(np.int32))
+        standing = np.full(states, UNDER_WAY, dtype=np.int8)
+        standing[self.automaton.accepting], standing[self.automaton.rejecting] = COMPLETE, FAILED
+        status = standing if self.status is None else np.asarray(self.status, dtype=np.int8)
+        stage = (status == COMPLETE).astype(np.int32) if self.stage is None else np.asarray(self.stage, dtype=np.int32)
+        for name, array in (("status", status), ("stage", stage)):
+            if array.shape != (states,):
+                raise ValueError(f"FieldProblem.{name} has shape {array.shape}, must be [{states}]")
+        object.__setattr__(self, "status", status)
+        object.__setattr__(self, "stage", stage)
 
     @property
     def reference(self) -> Reference:
         assert isinstance(self.transitions, Reference)
         return self.transitions
 
+    @property
+    def cells(self) -> int:
+        """C."""
+        return len(np.asarray(self.labels))
+
+    @property
+    def step_seconds(self) -> float:
+        """One tick; 1 if there is no scenario to say."""
+        return 1.0 if self.scenario is None else self.scenario.step_seconds
+
+    def earliest_of_stage(self, stage: int) -> NDArray[np.int64]:
+        """``[C]``: no start cell can have completed this stage before this tick (0 where nothing is known)."""
+        nothing = np.zeros(self.cells, dtype=np.int64)
+        if self.mission is None or self.grid is None or self.scenario is None:
+            given = np.broadcast_to(np.asarray(self.earliest_tick, dtype=np.int64), nothing.shape)
+            return given if stage == len(self.stage_names) - 1 else nothing
+        from tab_marl.field.stages import earliest_of_stage
+
+        return earliest_of_stage(self.mission, self.scenario, self.grid, stage)
+
+    def constrained(self, *constraints: SoftConstraint | TimingPrior) -> FieldProblem:
+        """The same problem with these constraints beside those it has.
+
+        The automaton grows by what the events need to be watched. Raises ValueError for an event that cannot be.
+        """
+        from tab_marl.field.tracking import with_constraints
+
+        return with_constraints(self, constraints)
+
     @classmethod
     def from_mission(
         cls,
         mission: Mission | str,
-        scenario: Scenario,
+        scenario: Scenario | Volume,
         options: FieldOptions | None = None,
         horizon_ticks: int | None = None,
+        constraints: Sequence[SoftConstraint | TimingPrior] = (),
     ) -> FieldProblem:
-        """The field of a mission (or its English text) in a scenario.
+        """The field of a mission (or its English text) in a scenario, under soft constraints beside it.
 
         The start is uniform over the free cells in `scenario.adversary_start` (the nearest free cell if there is none).
         """
@@ -187,7 +247,7 @@ class FieldProblem:
         tumbling = options.reference == "run_and_tumble"
         sizes = CELL_SIZES_METRES if options.cell_metres is None else (options.cell_metres,)
         for size in sizes:
-            grid = GridMap.from_scenario(scenario, size)
+            grid = map_of(scenario, size)
             automaton = unroll(compiled, horizon, compiled.masks(grid.centres))
             entries = len(automaton.delta) * grid.cells
             if entries * (options.headings + 1 if tumbling else 1) <= options.state_budget:
@@ -199,19 +259,20 @@ class FieldProblem:
         problem = cls._on_grid(compiled, grid, automaton, scenario, options, horizon)
         worth_it = entries * (options.headings + 1) > ROUGH_FROM and grid.cell_metres < ROUGH_CELL_METRES
         if worth_it and tumbling and options.goal_marginals and len(compiled.branch_places) > 1:
-            rough = GridMap.from_scenario(scenario, ROUGH_CELL_METRES)
+            rough = map_of(scenario, ROUGH_CELL_METRES)
             automaton = unroll(compiled, horizon, compiled.masks(rough.centres))
             coarse = replace(options, headings=8)
-            return replace(problem, rough=cls._on_grid(compiled, rough, automaton, scenario, coarse, horizon))
-        return problem
+            problem = replace(problem, rough=cls._on_grid(compiled, rough, automaton, scenario, coarse, horizon))
+        problem = replace(problem, mission=mission)
+        return problem.constrained(*constraints) if constraints else problem
 
     @classmethod
     def _on_grid(
         cls,
         compiled: MissionAutomaton,
-        grid: GridMap,
+        grid: GridMap | VoxelMap,
         automaton: TickAutomaton,
-        scenario: Scenario,
+        scenario: Scenario | Volume,
         options: FieldOptions,
         horizon: int,
     ) -> FieldProblem:
@@ -227,12 +288,14 @@ class FieldProblem:
             grid,
             scenario,
             tuple(compiled.branch_places),
-            _earliest_tick(compiled, grid, scenario) if options.timing_prior else 0,
+            earliest_tick(compiled, grid, scenario) if options.timing_prior else 0,
+            None,
+            *stages_of(compiled, automaton),
         )
 
 
 def _motion(
-    grid: GridMap, scenario: Scenario, options: FieldOptions, speed_limit: NDArray[np.float64]
+    grid: GridMap | VoxelMap, scenario: Scenario | Volume, options: FieldOptions, speed_limit: NDArray[np.float64]
 ) -> tuple[Reference, NDArray[np.int32]]:
     """One reference per speed limit in force somewhere, the fastest first, and which one holds in each state."""
     top = scenario.adversary.max_speed
@@ -241,20 +304,30 @@ def _motion(
     which = np.searchsorted(-speeds, -capped).astype(np.int32)
     steps = speeds * scenario.step_seconds
     if options.reference == "run_and_tumble":
-        return references.run_and_tumble(grid, steps, options.headings, options.mean_run_metres), which
-    build = references.walk if options.reference == "walk" else references.paper_walk
+        return processes.run_and_tumble(grid, steps, options.headings, options.mean_run_metres), which
+    build = processes.walk if options.reference == "walk" else processes.paper_walk
     return build(grid, steps), which
 
 
-def start_cells(grid: GridMap, scenario: Scenario) -> NDArray[np.float64]:
+def map_of(world: Scenario | Volume, cell_metres: float) -> GridMap | VoxelMap:
+    """The world cut into cells."""
+    if isinstance(world, Volume):
+        return VoxelMap.from_volume(world, cell_metres)
+    return GridMap.from_scenario(world, cell_metres)
+
+
+def start_cells(grid: GridMap | VoxelMap, scenario: Scenario | Volume) -> NDArray[np.float64]:
     """``[C]``: uniform over the free cells whose centres lie in the adversary's start region."""
-    inside = grid.inside(scenario.adversary_start)
+    region = scenario.adversary_start
+    inside = np.asarray(region.contains(grid.centres))
     if not inside.any():
-        inside[grid.cells_of([scenario.adversary_start.centre])] = True
+        inside[grid.cells_of([region.centre])] = True
     return np.asarray(inside / inside.sum())
 
 
-def _earliest_tick(compiled: MissionAutomaton, grid: GridMap, scenario: Scenario) -> NDArray[np.int64]:
+def earliest_tick(
+    compiled: MissionAutomaton, grid: GridMap | VoxelMap, scenario: Scenario | Volume
+) -> NDArray[np.int64]:
     """``[C]``: the first tick at which the shortest path at full speed from each start cell completes the mission."""
     from tab_marl.mission.route import solve_route
 

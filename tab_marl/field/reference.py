@@ -1,7 +1,8 @@
 """Reference processes Q(s'|s): physically feasible motion on cells, with or without a memory of the heading.
 
 The TAB-Field is the distribution closest to the reference that completes the mission (paper, eq. 1), so the reference
-says what motion is like when nothing but the mission is known. Base states are (cell, mode), cell-major.
+says what motion is like when nothing but the mission is known. Base states are (cell, mode), cell-major. `processes`
+builds references; `from_matrices` takes any.
 """
 
 from __future__ import annotations
@@ -16,13 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
 from tab_marl.field import kernels
-from tab_marl.world.grid import BLOCKED, GridMap
-
-# Run and tumble: events per mean run length. Small turns go to a neighbouring heading, redraws to any heading or rest.
-# Shares that predicted six kinds of purposeful movers best; the optimum is flat.
-TURNS_PER_RUN = 0.8
-REDRAWS_PER_RUN = 0.5
-REST_SHARE = 0.1
 
 UNROLLED_WIDTH = 4
 """Row length for which the kernels are unrolled: a displacement rounded to cells has at most four ends."""
@@ -214,126 +208,3 @@ def _check_rows(matrix: sparse.csr_array, name: str) -> None:
     if len(sums) and sums.max() > 1 + 1e-9:
         worst = int(sums.argmax())
         raise ValueError(f"{name}: row {worst} sums to {sums[worst]:.12g}, must be <= 1; divide the row by its sum")
-
-
-def run_and_tumble(
-    grid: GridMap, metres_per_tick: ArrayLike, headings: int = 16, mean_run_metres: float = 0.5
-) -> Reference:
-    """Straight runs at full speed with small turns, and now and then a new heading or a rest; killed at walls.
-
-    Args:
-        metres_per_tick: one per reference (speed limits): ``[R]`` metres.
-        headings: how many directions; mode `headings` is rest.
-        mean_run_metres: scale of the run length at the first (full) speed.
-    """
-    if headings < 3:
-        raise ValueError(f"headings is {headings}, must be >= 3")
-    if not mean_run_metres > 0:
-        raise ValueError(f"mean_run_metres is {mean_run_metres}, must be > 0")
-    speeds = np.atleast_1d(np.asarray(metres_per_tick, dtype=np.float64))
-    angles = 2 * np.pi * np.arange(headings) / headings
-    direction = np.append(np.stack([np.cos(angles), np.sin(angles)], axis=1), [[0.0, 0.0]], axis=0)
-    modes = headings + 1
-    # An event rate per metre of run; many events in one tick saturate at certainty.
-    events = min(1.0, speeds[0] / mean_run_metres * (TURNS_PER_RUN + REDRAWS_PER_RUN))
-    turn = events * TURNS_PER_RUN / (TURNS_PER_RUN + REDRAWS_PER_RUN)
-    redraw = events - turn
-    mix = np.zeros((modes, modes))
-    for m in range(headings):
-        mix[m, (m - 1) % headings] += turn / 2
-        mix[m, (m + 1) % headings] += turn / 2
-    mix[headings, headings] = turn
-    mix += (1 - events) * np.eye(modes)
-    anew = np.append(np.full(headings, (1 - REST_SHARE) / headings), REST_SHARE)
-    mix += redraw * anew
-    parts = []
-    for speed in speeds:
-        rows, columns, data = [], [], []
-        for m in range(modes):
-            source, target, share = _rounded_moves(grid, speed * direction[m])
-            rows.append(source * modes + m)
-            columns.append(target * modes + m)
-            data.append(share)
-        parts.append(_gather(rows, columns, data, grid.cells * modes))
-    return from_matrices(parts, mix, np.append(angles, np.nan), np.full(modes, redraw), anew)
-
-
-def walk(grid: GridMap, metres_per_tick: ArrayLike, directions: int = 16) -> Reference:
-    """Memoryless: each tick a displacement uniform over the disc of full speed, rounded to cells; no walls entered.
-
-    Where walls take a part of a row, the rest is scaled to 1 (paper: the state never enters an obstacle).
-    """
-    angles = 2 * np.pi * np.arange(directions) / directions
-    circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    # Rings of equal width carry mass in proportion to their radius; the outermost is full speed itself.
-    rings = [(0.0, 1.0)] + [(radius, 8.0 * radius) for radius in (0.5, 1.0)]
-    total = sum(mass for _, mass in rings)
-    parts = []
-    for speed in np.atleast_1d(np.asarray(metres_per_tick, dtype=np.float64)):
-        rows, columns, data = [], [], []
-        for radius, mass in rings:
-            for move in circle if radius else np.zeros((1, 2)):
-                source, target, share = _rounded_moves(grid, speed * radius * move)
-                rows.append(source)
-                columns.append(target)
-                data.append(share * (mass / total / (directions if radius else 1)))
-        parts.append(_normalised(_gather(rows, columns, data, grid.cells)))
-    return from_matrices(parts)
-
-
-def paper_walk(grid: GridMap, metres_per_tick: ArrayLike) -> Reference:
-    """Memoryless, the letter of the paper: uniform over all free cells whose centres lie within one tick's reach."""
-    parts = []
-    for speed in np.atleast_1d(np.asarray(metres_per_tick, dtype=np.float64)):
-        reach = speed / grid.cell_metres + 1e-9
-        whole = int(reach)
-        rows, columns, data = [], [], []
-        for dr in range(-whole, whole + 1):
-            for dc in range(-whole, whole + 1):
-                if np.hypot(dr, dc) <= reach:
-                    source, target = _shifted(grid, dr, dc)
-                    rows.append(source)
-                    columns.append(target)
-                    data.append(np.ones(len(source)))
-        parts.append(_normalised(_gather(rows, columns, data, grid.cells)))
-    return from_matrices(parts)
-
-
-def _shifted(grid: GridMap, rows_up: int, columns_right: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """(source cells, target cells) of one whole-cell offset, blocked targets left out."""
-    row, column = grid.row + rows_up, grid.column + columns_right
-    height, width = grid.cell_at.shape
-    inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-    target = np.full(grid.cells, BLOCKED, dtype=np.int64)
-    target[inside] = grid.cell_at[row[inside], column[inside]]
-    free = target != BLOCKED
-    return np.flatnonzero(free), target[free]
-
-
-def _rounded_moves(
-    grid: GridMap, metres: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """One displacement from every cell, rounded at random to the four cells around its end so that the mean is exact."""
-    across, up = metres / grid.cell_metres
-    column, row = int(np.floor(across + 1e-9)), int(np.floor(up + 1e-9))
-    share_right, share_up = max(0.0, across - column), max(0.0, up - row)
-    sources, targets, shares = [], [], []
-    for dr, part_up in ((row, 1 - share_up), (row + 1, share_up)):
-        for dc, part_right in ((column, 1 - share_right), (column + 1, share_right)):
-            if part_up * part_right > 1e-12:
-                source, target = _shifted(grid, dr, dc)
-                sources.append(source)
-                targets.append(target)
-                shares.append(np.full(len(source), part_up * part_right))
-    return np.concatenate(sources), np.concatenate(targets), np.concatenate(shares)
-
-
-def _gather(
-    rows: list[NDArray[np.int64]], columns: list[NDArray[np.int64]], data: list[NDArray[np.float64]], states: int
-) -> sparse.csr_array:
-    entries = (np.concatenate(data), (np.concatenate(rows), np.concatenate(columns)))
-    return sparse.csr_array(sparse.coo_array(entries, shape=(states, states)))
-
-
-def _normalised(matrix: sparse.csr_array) -> sparse.csr_array:
-    return sparse.csr_array(sparse.diags_array(1 / np.asarray(matrix.sum(axis=1)).ravel()) @ matrix)

@@ -20,7 +20,7 @@ class Trajectories:
     """K trajectories; column 0 is now, one column per tick."""
 
     positions: NDArray[np.float64]
-    """``[K, ticks + 1, 2]`` metres: cell centres, moved by one offset per trajectory, uniform within the cell."""
+    """``[K, ticks + 1, D]`` metres: cell centres, moved by one offset per trajectory, uniform within the cell."""
     completed_tick: NDArray[np.int32]
     """``[K]`` tick at which the mission completes (0: it is complete now), -1 if not within these ticks."""
     cells: NDArray[np.int32]
@@ -58,5 +58,5 @@ def sample_paths(
     cells, modes = np.divmod(base_states, np.int32(chain.modes))
     positions = chain.centres[cells]
     if jitter:
-        positions += (rng.random((count, 1, 2)) - 0.5) * chain.cell_metres
+        positions += (rng.random((count, 1, positions.shape[2])) - 0.5) * chain.cell_metres
     return Trajectories(positions, completed_tick, cells, modes, automaton_states)

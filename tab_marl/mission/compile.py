@@ -19,8 +19,8 @@ from tab_marl.mission.automaton import (
     MissionAutomaton,
 )
 from tab_marl.mission.model import Constraint, ConstraintType, Mission, place_name
+from tab_marl.mission.places import MissionWorld
 from tab_marl.mission.propositions import Propositions
-from tab_marl.world.scenario import Scenario
 
 # Bounds are compared in ticks; this absorbs the rounding of seconds / tick_seconds.
 TICK_ROUNDING = 1e-9
@@ -36,7 +36,7 @@ def ticks_at_least(seconds: float, tick_seconds: float) -> int:
     return max(0, math.ceil(seconds / tick_seconds - TICK_ROUNDING))
 
 
-def exact_window_seconds(seconds: float, scenario: Scenario) -> tuple[float, float]:
+def exact_window_seconds(seconds: float, scenario: MissionWorld) -> tuple[float, float]:
     """The window that `exact` means: +- max(exact_seconds, exact_fraction * seconds)."""
     tolerance = max(scenario.exact_seconds, scenario.exact_fraction * seconds)
     return seconds - tolerance, seconds + tolerance
@@ -55,7 +55,7 @@ class _Location:
     """The place just visited and not left yet (recurrence), or -1."""
 
 
-def compile_mission(mission: Mission, scenario: Scenario, tick_seconds: float | None = None) -> MissionAutomaton:
+def compile_mission(mission: Mission, scenario: MissionWorld, tick_seconds: float | None = None) -> MissionAutomaton:
     """The mission's automaton on this scenario at this tick (default: the scenario's `step_seconds`).
 
     Raises UnknownName for a place the scenario lacks, ValueError for a window that holds no tick or too many regions.
@@ -69,7 +69,7 @@ def compile_mission(mission: Mission, scenario: Scenario, tick_seconds: float | 
     return _Compilation(mission, scenario, tick, propositions).automaton()
 
 
-def _propositions(mission: Mission, scenario: Scenario) -> Propositions:
+def _propositions(mission: Mission, scenario: MissionWorld) -> Propositions:
     found = Propositions(scenario)
     for constraint in mission.constraints:
         for place in (*constraint.places, *constraint.restricted):
@@ -89,7 +89,7 @@ def _violation(constraint: Constraint, propositions: Propositions) -> NDArray[np
 
 
 def _without_goals(
-    mission: Mission, scenario: Scenario, tick: float, propositions: Propositions
+    mission: Mission, scenario: MissionWorld, tick: float, propositions: Propositions
 ) -> MissionAutomaton:  # fmt: skip
     """always/until only: completed when everything held to the horizon (or to the last `until`, if all are)."""
     labels = len(propositions.masks)
@@ -129,7 +129,7 @@ def _standing_speed_limit(mission: Mission) -> float:
 class _Compilation:
     """Numbers the locations of a mission with goals and fills their tables."""
 
-    def __init__(self, mission: Mission, scenario: Scenario, tick: float, propositions: Propositions) -> None:
+    def __init__(self, mission: Mission, scenario: MissionWorld, tick: float, propositions: Propositions) -> None:
         self.mission, self.scenario, self.tick, self.propositions = mission, scenario, tick, propositions
         self.goals = mission.goals
         self.locations = self._enumerate()

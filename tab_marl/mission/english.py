@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 from tab_marl.mission.model import Constraint, ConstraintType, Mission, Place, place_name, plain_number
 from tab_marl.mission.parse import COUNTS, DEFAULT_RECURRENCES
-from tab_marl.world.scenario import Scenario
+from tab_marl.mission.places import MissionWorld
 
 
-def to_english(mission: Mission, scenario: Scenario | None = None) -> str:
+def to_english(mission: Mission, scenario: MissionWorld | None = None) -> str:
     """The mission in one sentence; with a scenario, all its checkpoints together are called "checkpoints".
 
     Reading it back gives the same mission, goals first and then what runs beside them.

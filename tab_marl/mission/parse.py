@@ -12,9 +12,9 @@ from lark import Lark, Token, Tree, UnexpectedInput
 from lark.lexer import PatternRE, TerminalDef
 
 from tab_marl.mission.model import Constraint, ConstraintType, Mission, Place
+from tab_marl.mission.places import MissionWorld
 from tab_marl.mission.propositions import region_of
 from tab_marl.mission.syntax_errors import MissionSyntaxError, explain
-from tab_marl.world.scenario import Scenario
 
 COUNTS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
 DEFAULT_RECURRENCES = 3
@@ -22,7 +22,7 @@ DEFAULT_RECURRENCES = 3
 
 
 def parse_mission(
-    text: str, scenario: Scenario, *, target: tuple[float, float] | None = None, name: str = ""
+    text: str, scenario: MissionWorld, *, target: tuple[float, float] | None = None, name: str = ""
 ) -> Mission:
     """Read a mission such as "Reach Checkpoint A within 5s", "Visit any three different checkpoints every 10s".
 
@@ -77,7 +77,7 @@ Draft = dict[str, Any]
 class _Reader:
     """Turns a parse tree into constraints."""
 
-    def __init__(self, scenario: Scenario, target: tuple[float, float] | None, text: str) -> None:
+    def __init__(self, scenario: MissionWorld, target: tuple[float, float] | None, text: str) -> None:
         self.scenario, self.target, self.text = scenario, target, text
         self.spellings = scenario.spellings()
         self.checkpoints: tuple[Place, ...] = tuple(c.name for c in scenario.checkpoints)

@@ -3,32 +3,38 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tab_marl.mission.model import Place, place_name
+from tab_marl.mission.places import MissionWorld
 from tab_marl.world.regions import Box, Disc, Polygon, Region
 from tab_marl.world.scenario import Scenario
+from tab_marl.world.solids import Ball, Cuboid
 
 MOST_PROPOSITIONS = 12
 """Tables have 2**P columns."""
 
 
-def region_of(place: Place, scenario: Scenario) -> Region:
+def region_of(place: Place, world: MissionWorld) -> Region:
     """The region a place stands for. Raises UnknownName, or ValueError for a point outside the arena."""
-    if isinstance(place, str):
-        return scenario.region(place)
-    x, y = place
-    if not (0 <= x <= scenario.width_metres and 0 <= y <= scenario.height_metres):
-        raise ValueError(
-            f"target {place_name(place)} lies outside the {scenario.width_metres} x {scenario.height_metres} m arena"
-        )
-    return Disc(x, y, scenario.target_radius_metres)
+    region = world.place(place)
+    if not isinstance(place, str) and isinstance(world, Scenario):
+        x, y = place
+        if not (0 <= x <= world.width_metres and 0 <= y <= world.height_metres):
+            raise ValueError(
+                f"target {place_name(place)} lies outside the {world.width_metres} x {world.height_metres} m arena"
+            )
+    # A solid answers the same questions about points in space. Typed by the plane, where most callers draw regions.
+    return cast(Region, region)
 
 
 def grown(region: Region, metres: float) -> Region:
     """The region with every side moved outwards (corners stay corners)."""
+    if isinstance(region, Ball | Cuboid):
+        return cast(Region, region.grown(metres))
     if isinstance(region, Disc):
         return Disc(region.x, region.y, region.radius + metres)
     if isinstance(region, Box):
@@ -46,7 +52,7 @@ def grown(region: Region, metres: float) -> Region:
 class Propositions:
     """Collects distinct regions while a mission is compiled."""
 
-    scenario: Scenario
+    scenario: MissionWorld
     regions: list[Region] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
 

@@ -7,7 +7,7 @@ import re
 
 from lark import UnexpectedCharacters, UnexpectedInput, UnexpectedToken
 
-from tab_marl.world.scenario import Scenario
+from tab_marl.mission.places import MissionWorld
 
 PHRASES: dict[str, tuple[str, ...]] = {
     "REACH": ("Reach", "Visit", "Go to"),
@@ -107,7 +107,7 @@ class MissionSyntaxError(ValueError):
         )  # fmt: skip
 
 
-def explain(error: UnexpectedInput, text: str, scenario: Scenario) -> MissionSyntaxError:
+def explain(error: UnexpectedInput, text: str, scenario: MissionWorld) -> MissionSyntaxError:
     """The parser's complaint in words."""
     terminals: set[str] = set()
     if isinstance(error, UnexpectedToken):
@@ -151,7 +151,7 @@ def _first_words(text: str, count: int) -> str:
     return match.group().strip() if match else ""
 
 
-def _nearest(text: str, terminals: set[str], scenario: Scenario) -> tuple[str, list[str]]:
+def _nearest(text: str, terminals: set[str], scenario: MissionWorld) -> tuple[str, list[str]]:
     """(the words that were probably misspelt, the equally near known spellings); ("", []) if nothing is near."""
     known: list[tuple[str, str, str, float]] = []  # spelling, how to show it, what it means, handicap
     if "PLACE" in terminals:

@@ -64,8 +64,15 @@ def sample_task(
     family: str = "point",
     slack: float | None = None,
     options: MapOptions | None = None,
+    *,
+    scenario: Scenario | None = None,
+    far_metres: float = FAR_METRES,
 ) -> Task:
-    """Draw a task. `slack` None draws it uniformly from SLACK_RANGE. Raises UnknownName for a wrong id or family."""
+    """Draw a task. `slack` None draws it uniformly from SLACK_RANGE. Raises UnknownName for a wrong id or family.
+
+    `scenario`: the map, where it is not to be drawn; goals, starts and deadlines still are. `far_metres`: between the
+    adversary's start and its first goal, and between the two starts, at least.
+    """
     if mission_id not in MISSION_IDS:
         raise UnknownName("mission type", mission_id, MISSION_IDS)
     if family not in FAMILIES:
@@ -74,22 +81,41 @@ def sample_task(
         raise ValueError(f"slack is {slack}, must be > 1 (allowed time / shortest time)")
     for _ in range(MAPS):
         drawn = float(rng.uniform(*SLACK_RANGE)) if slack is None else slack
-        task = _attempt(rng, mission_id, family, drawn, options)
+        map_drawn = sample_scenario(rng, options, name=f"{mission_id}-{family}") if scenario is None else scenario
+        order = np.arange(len(map_drawn.checkpoints)) if scenario is None else _goal_order(rng, scenario, mission_id)
+        task = _attempt(rng, map_drawn, order, mission_id, family, drawn, far_metres)
         if task is not None:
             return task
-    raise RuntimeError(f"no winnable {family} {mission_id} task with slack {slack} found on {MAPS} maps")
+    where = f"{MAPS} maps" if scenario is None else f"scenario {scenario.name!r} in {MAPS} draws"
+    raise RuntimeError(f"no winnable {family} {mission_id} task with slack {slack} found on {where}")
+
+
+def _goal_order(rng: np.random.Generator, scenario: Scenario, mission_id: str) -> NDArray[np.int_]:
+    """Checkpoints of a given map in random order: the first are the goals. M4 keeps off those in the central zone."""
+    order = rng.permutation(len(scenario.checkpoints))
+    if mission_id == "M4":
+        zone = scenario.region("central zone")
+        centres = np.array([scenario.checkpoints[i].region.centre for i in order]).reshape(-1, 2)
+        reach = np.array([scenario.checkpoints[i].radius_metres for i in order])
+        order = order[zone.distance(centres) >= reach]
+    return order
 
 
 def _attempt(
-    rng: np.random.Generator, mission_id: str, family: str, slack: float, options: MapOptions | None
+    rng: np.random.Generator,
+    scenario: Scenario,
+    order: NDArray[np.int_],
+    mission_id: str,
+    family: str,
+    slack: float,
+    far_metres: float,
 ) -> Task | None:
-    scenario = sample_scenario(rng, options, name=f"{mission_id}-{family}")
     if family == "perimeter":
-        widened = _widen(rng, scenario, mission_id)
+        widened = _widen(rng, scenario, order, mission_id)
         if widened is None:
             return None
         scenario = widened
-    legs = _legs(rng, scenario, mission_id, family)
+    legs = _legs(rng, scenario, order, mission_id, family)
     if legs is None:
         return None
     grid = GridMap.from_scenario(scenario, PLANNING_CELL_METRES)
@@ -98,7 +124,7 @@ def _attempt(
     clear = scenario.adversary.radius_metres + START_RADIUS_METRES
 
     def far_from_goals(points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        ok = np.min([region.distance(points) for region in first], axis=0) >= FAR_METRES
+        ok = np.min([region.distance(points) for region in first], axis=0) >= far_metres
         if travel.avoid_centre:
             ok &= scenario.region("central zone").distance(points) >= clear
         return np.asarray(ok)
@@ -113,7 +139,7 @@ def _attempt(
     meets = np.all([travel.ego_meets(way.path) for way in ways], axis=0)
 
     def fair(points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        apart = np.hypot(points[:, 0] - start.x, points[:, 1] - start.y) >= FAR_METRES
+        apart = np.hypot(points[:, 0] - start.x, points[:, 1] - start.y) >= far_metres
         return np.asarray(meets & apart)
 
     ego = sample_disc(rng, grid, 0.05, fair)
@@ -123,12 +149,12 @@ def _attempt(
     return Task(scenario, mission, mission_id, family, round(slack, 3))
 
 
-def _widen(rng: np.random.Generator, scenario: Scenario, mission_id: str) -> Scenario | None:
+def _widen(rng: np.random.Generator, scenario: Scenario, order: NDArray[np.int_], mission_id: str) -> Scenario | None:
     """Make the last goal wider than the interception radius, if the map leaves room for it."""
     radius = round(float(rng.uniform(*PERIMETER_METRES)), 2)
     if mission_id == "M5":
         return replace(scenario, target_radius_metres=radius)
-    index = 1 if mission_id == "M2" else 0
+    index = int(order[1 if mission_id == "M2" else 0])
     goal = replace(scenario.checkpoints[index], radius_metres=radius, camera_metres=round(radius + 0.15, 2))
     others = [c for i, c in enumerate(scenario.checkpoints) if i != index]
     if any(math.hypot(goal.x - c.x, goal.y - c.y) < radius + c.radius_metres + 0.2 for c in others):
@@ -140,9 +166,11 @@ def _widen(rng: np.random.Generator, scenario: Scenario, mission_id: str) -> Sce
     return replace(scenario, checkpoints=tuple(checkpoints))
 
 
-def _legs(rng: np.random.Generator, scenario: Scenario, mission_id: str, family: str) -> list[tuple[Place, ...]] | None:
+def _legs(
+    rng: np.random.Generator, scenario: Scenario, order: NDArray[np.int_], mission_id: str, family: str
+) -> list[tuple[Place, ...]] | None:
     """The goals in order, each as the tuple of places of which one will do."""
-    names: list[Place] = [c.name for c in scenario.checkpoints]
+    names: list[Place] = [scenario.checkpoints[i].name for i in order]
     several = family == "ambiguous"
     if mission_id == "M2":
         return [tuple(names[:2]), tuple(names[2:4])] if several else [(names[0],), (names[1],)]
@@ -153,15 +181,20 @@ def _legs(rng: np.random.Generator, scenario: Scenario, mission_id: str, family:
 
 
 def _targets(rng: np.random.Generator, scenario: Scenario, count: int) -> tuple[Place, ...] | None:
-    """Bare target points, clear of checkpoints, obstacles, walls and the central zone."""
+    """Bare target points, clear of checkpoints, obstacles, walls and the central zone; closer where there is no room."""
+    return _clear_targets(rng, scenario, count, 0.1) or _clear_targets(rng, scenario, count, 0.0)
+
+
+def _clear_targets(rng: np.random.Generator, scenario: Scenario, count: int, margin: float) -> tuple[Place, ...] | None:
+    """Targets with so many metres more than needed between their discs and everything else."""
     radius = scenario.target_radius_metres
     grid = GridMap.from_scenario(scenario, PLANNING_CELL_METRES)
-    ok = scenario.region("central zone").distance(grid.centres) >= radius + 0.1
+    ok = scenario.region("central zone").distance(grid.centres) >= radius + margin
     for c in scenario.checkpoints:
-        ok &= c.region.distance(grid.centres) >= radius + 0.15
+        ok &= c.region.distance(grid.centres) >= radius + margin + 0.05
     if radius < scenario.interception_metres:  # a wide target may reach under an obstacle, a small one may not
         for obstacle in scenario.obstacles:
-            ok &= obstacle.distance(grid.centres) >= radius + 0.105
+            ok &= obstacle.distance(grid.centres) >= radius + margin + 0.005
     chosen: list[Place] = []
     for _ in range(count):
         candidates = np.flatnonzero(ok)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +16,8 @@ from tab_marl.world.scenario import Scenario
 
 BLOCKED = -1
 """`GridMap.cell_at` of a blocked square."""
+MOST_CELLS = 20_000_000
+"""A map is refused beyond this many cells, blocked ones included: its arrays alone would take gigabytes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +48,11 @@ class GridMap:
     @property
     def cells(self) -> int:
         return len(self.centres)
+
+    @cached_property
+    def index(self) -> NDArray[np.int32]:
+        """``[S, 2]`` (row, column)."""
+        return np.stack([self.row, self.column], axis=1)
 
     def cells_of(self, points: ArrayLike) -> NDArray[np.int32]:
         """``[N]``: the free cell nearest to each point ``[N, 2]`` (ties go to the lower number)."""
@@ -81,6 +90,7 @@ class GridMap:
 def _grid_of(scenario: Scenario, cell_metres: float, radius: float) -> GridMap:
     columns = max(1, round(scenario.width_metres / cell_metres))
     rows = max(1, round(scenario.height_metres / cell_metres))
+    refuse_too_many([columns, rows], cell_metres)
     x = (np.arange(columns) + 0.5) * cell_metres
     y = (np.arange(rows) + 0.5) * cell_metres
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
@@ -94,6 +104,16 @@ def _grid_of(scenario: Scenario, cell_metres: float, radius: float) -> GridMap:
     cell_at[free] = np.arange(int(free.sum()), dtype=np.int32)
     row, column = np.divmod(np.flatnonzero(free).astype(np.int32), np.int32(columns))
     return GridMap(cell_metres, cell_at.reshape(rows, columns), points[free], row, column)
+
+
+def refuse_too_many(counts: Sequence[int], cell_metres: float) -> None:
+    """Raise ValueError if a map of so many cells along each axis is too large to lay out."""
+    total = math.prod(counts)
+    if total > MOST_CELLS:
+        raise ValueError(
+            f"cell_metres is {cell_metres}: the map would have {' x '.join(map(str, counts))} = {total:,} cells, more "
+            f"than {MOST_CELLS:,}; use larger cells"
+        )
 
 
 def free_points(scenario: Scenario, points: ArrayLike, radius_metres: float) -> NDArray[np.bool_]:

@@ -1,0 +1,6 @@
+"""Reference processes: what motion is like when nothing but physics is known."""
+
+from tab_marl.field.processes.isotropic import paper_walk, walk
+from tab_marl.field.processes.tumble import run_and_tumble
+
+__all__ = ["paper_walk", "run_and_tumble", "walk"]

@@ -1,0 +1,84 @@
+"""Run and tumble: motion that keeps its heading for a while, in the plane and in space."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tab_marl.field.processes.isotropic import speeds_of
+from tab_marl.field.processes.stencils import Cells, rounded, rows_of
+from tab_marl.field.reference import Reference, from_matrices
+
+Floats = NDArray[np.float64]
+
+# Events per mean run length. Small turns go to a neighbouring heading, redraws to any heading or rest.
+# Shares that predicted six kinds of purposeful movers best; the optimum is flat.
+TURNS_PER_RUN = 0.8
+REDRAWS_PER_RUN = 0.5
+REST_SHARE = 0.1
+
+SPATIAL_HEADINGS = (6, 14, 26)
+"""Directions in space: towards a cube's faces; and its corners; and its edges."""
+
+
+def run_and_tumble(
+    grid: Cells, metres_per_tick: ArrayLike, headings: int = 16, mean_run_metres: float = 0.5
+) -> Reference:
+    """Straight runs at full speed with small turns, and now and then a new heading or a rest; killed at walls.
+
+    Args:
+        metres_per_tick: one per reference (speed limits): ``[R]`` metres.
+        headings: how many directions, evenly around the circle; in space the next of SPATIAL_HEADINGS. The last mode
+            is rest.
+        mean_run_metres: scale of the run length at the first (full) speed.
+    """
+    if headings < 3:
+        raise ValueError(f"headings is {headings}, must be >= 3")
+    if not mean_run_metres > 0:
+        raise ValueError(f"mean_run_metres is {mean_run_metres}, must be > 0")
+    speeds = speeds_of(metres_per_tick)
+    planar = grid.index.shape[1] == 2
+    if planar:
+        angles = 2 * np.pi * np.arange(headings) / headings
+        direction = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        beside = np.roll(np.eye(headings), 1, axis=1) + np.roll(np.eye(headings), -1, axis=1)
+    else:
+        direction = spatial_directions(headings)
+        headings = len(direction)
+        angles = np.full(headings, np.nan)
+        beside = _nearest(direction)
+    # An event rate per metre of run; many events in one tick saturate at certainty.
+    events = min(1.0, speeds[0] / mean_run_metres * (TURNS_PER_RUN + REDRAWS_PER_RUN))
+    turn = events * TURNS_PER_RUN / (TURNS_PER_RUN + REDRAWS_PER_RUN)
+    redraw = events - turn
+    mix = np.zeros((headings + 1, headings + 1))
+    mix[:headings, :headings] = turn * beside / beside.sum(axis=1).max()
+    # What a small turn does not take stays: rest, and in space headings with fewer neighbours. So the matrix stays
+    # symmetric, and no heading is preferred.
+    np.fill_diagonal(mix, 1 - redraw - mix.sum(axis=1))
+    anew = np.append(np.full(headings, (1 - REST_SHARE) / headings), REST_SHARE)
+    mix += redraw * anew
+    rest = np.zeros(direction.shape[1])
+    parts = []
+    for speed in speeds:
+        moves = [*(speed * direction), rest]
+        parts.append(rows_of(grid, [rounded(move, 1.0, grid.cell_metres, m) for m, move in enumerate(moves)]))
+    return from_matrices(parts, mix, np.append(angles, np.nan), np.full(headings + 1, redraw), anew)
+
+
+def spatial_directions(headings: int) -> Floats:
+    """``[N, 3]`` unit vectors: the smallest of SPATIAL_HEADINGS that is not below `headings` (26 beyond)."""
+    wanted = next((n for n in SPATIAL_HEADINGS if n >= headings), SPATIAL_HEADINGS[-1])
+    moves = np.array(np.meshgrid([-1, 0, 1], [-1, 0, 1], [-1, 0, 1], indexing="ij")).reshape(3, -1).T
+    kind = np.abs(moves).sum(axis=1)
+    kinds = {6: (1,), 14: (1, 3), 26: (1, 2, 3)}[wanted]
+    moves = moves[np.isin(kind, kinds)]
+    return np.asarray(moves / np.linalg.norm(moves, axis=1)[:, None])
+
+
+def _nearest(direction: Floats) -> Floats:
+    """``[N, N]`` 1 between directions that are neighbours: some direction is no nearer to either."""
+    cosine = direction @ direction.T
+    np.fill_diagonal(cosine, -2)
+    nearest = cosine >= cosine.max(axis=1)[:, None] - 1e-9
+    return np.asarray((nearest | nearest.T).astype(np.float64))
