@@ -2,22 +2,35 @@
 
 from tab_marl.field.belief import BeliefOptions, ProductBelief
 from tab_marl.field.chain import ProductChain, product_chain
+from tab_marl.field.contradiction import ContradictoryConstraints
+from tab_marl.field.events import Completes, IsAt, Passes, SoftConstraint, TimingPrior, Tracker
+from tab_marl.field.infeasible import InfeasibleField
 from tab_marl.field.problem import FieldOptions, FieldProblem
 from tab_marl.field.processes import paper_walk, run_and_tumble, walk
 from tab_marl.field.reference import Reference, from_matrices
+from tab_marl.field.report import ConstraintFit, FitReport
 from tab_marl.field.sampling import Trajectories, sample_paths
-from tab_marl.field.solve import InfeasibleField, solve
+from tab_marl.field.solve import solve
 from tab_marl.field.tab_field import TabField
 
 __all__ = [
     "BeliefOptions",
+    "Completes",
+    "ConstraintFit",
+    "ContradictoryConstraints",
     "FieldOptions",
     "FieldProblem",
+    "FitReport",
     "InfeasibleField",
+    "IsAt",
+    "Passes",
     "ProductBelief",
     "ProductChain",
     "Reference",
+    "SoftConstraint",
     "TabField",
+    "TimingPrior",
+    "Tracker",
     "Trajectories",
     "from_matrices",
     "paper_walk",

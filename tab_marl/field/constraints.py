@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.field.problem import FieldProblem
+from tab_marl.field.problem import COMPLETE, FieldProblem
 
 Floats = NDArray[np.float64]
 UNUSED = -1
@@ -55,6 +55,15 @@ class Tilt:
     """Feasible completion ticks."""
     tick_shares: Floats
     """Their wanted shares, sum 1."""
+    fixed: Floats | None = None
+    """``[Q, L]``: log of the factors, known from elsewhere (soft constraints, a file); then nothing is left to fit."""
+
+    @classmethod
+    def given(cls, problem: FieldProblem, log_weight: Floats, log_failure: float) -> Tilt:
+        """Weights that need no fit."""
+        branches = np.zeros(int(problem.automaton.branch.max(initial=-1)) + 1)
+        unused = np.full(problem.automaton.delta.shape, UNUSED, dtype=np.int64)
+        return cls(problem, [], unused, branches, np.zeros(0), log_failure, np.arange(0), np.empty(0), fixed=log_weight)
 
     @classmethod
     def of(cls, problem: FieldProblem) -> Tilt:
@@ -74,7 +83,7 @@ class Tilt:
         ticks = int(completion.max(initial=-1)) + 1
         return cls(
             problem,
-            _within_reach(problem, alternatives(problem)) if options.goal_marginals else [],
+            reachable_places(problem, alternatives(problem)) if options.goal_marginals else [],
             completion,
             np.zeros(int(automaton.branch.max(initial=-1)) + 1),
             np.zeros(ticks),
@@ -86,6 +95,10 @@ class Tilt:
     @property
     def needed(self) -> bool:
         """Whether anything has to be fitted."""
+        return self.fixed is None and self._constrained
+
+    @property
+    def _constrained(self) -> bool:
         return bool(self.branch_groups) or self.completion_tick.max(initial=-1) >= 0 or np.isfinite(self.log_failure)
 
     @property
@@ -95,6 +108,8 @@ class Tilt:
 
     def log_weight(self) -> Floats:
         """``[Q, L]``: log of the factor on each transition."""
+        if self.fixed is not None:
+            return self.fixed
         branch = self.problem.automaton.branch
         total = np.zeros(branch.shape)
         if len(self.log_branch):
@@ -117,7 +132,8 @@ class Tilt:
         return np.asarray(ticks, dtype=np.float64)
 
     def completed(self, flux: Floats) -> float:
-        into = self.problem.automaton.delta == self.problem.automaton.accepting
+        complete = np.asarray(self.problem.status) == COMPLETE
+        into = complete[self.problem.automaton.delta] & ~complete[:, None]
         return float(flux[into].sum())
 
     def drop_infeasible(self, flux: Floats) -> None:
@@ -229,7 +245,7 @@ def alternatives(problem: FieldProblem) -> list[NDArray[np.int64]]:
     return [group for group in groups if len(group) > 1]
 
 
-def _within_reach(problem: FieldProblem, groups: list[NDArray[np.int64]]) -> list[NDArray[np.int64]]:
+def reachable_places(problem: FieldProblem, groups: list[NDArray[np.int64]]) -> list[NDArray[np.int64]]:
     """Leave out places farther from every start than full speed covers until they may last be visited.
 
     Rounding to cells lets the reference be faster than the robot with a small probability; equal mass would make it large.

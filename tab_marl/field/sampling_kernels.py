@@ -112,7 +112,7 @@ def sample_paths(chain, streams, automaton_states, base_states, completed_tick):
     states = chain.value.shape[1]
     count, columns = base_states.shape
     for i in range(count):
-        completed_tick[i] = 0 if automaton_states[i, 0] == chain.accepting else -1
+        completed_tick[i] = 0 if chain.complete[automaton_states[i, 0]] else -1
     # Tick by tick: the paths of one tick read the same rows of the table.
     for t in range(1, columns):
         for i in range(count):
@@ -126,5 +126,5 @@ def sample_paths(chain, streams, automaton_states, base_states, completed_tick):
             q = chain.delta[q, chain.symbol_of[following]]
             automaton_states[i, t] = q
             base_states[i, t] = following
-            if q == chain.accepting and completed_tick[i] < 0:
+            if chain.complete[q] and completed_tick[i] < 0:
                 completed_tick[i] = t

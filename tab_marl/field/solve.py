@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.field import kernels
+from tab_marl.field import kernels, tracking_kernels
 from tab_marl.field.belief import ProductBelief
 from tab_marl.field.chain import ProductChain, product_chain
 from tab_marl.field.constraints import Tilt
 from tab_marl.field.fitting import History, fit
-from tab_marl.field.problem import FieldProblem
+from tab_marl.field.infeasible import InfeasibleField
+from tab_marl.field.problem import COMPLETE, UNDER_WAY, FieldProblem
 from tab_marl.field.sampling import Trajectories, sample_paths
 from tab_marl.field.tab_field import TabField, expected_transitions, start_log_partition
 
@@ -25,10 +26,6 @@ PEAK = {"single": 2.0**100, "double": 2.0**930}
 
 SAMPLED_PATHS = 2000
 """Trajectories that show how visits go together; their sampling error only slows the fit."""
-
-
-class InfeasibleField(ValueError):
-    """No trajectory of the reference process completes the mission from any start."""
 
 
 def solve(problem: FieldProblem) -> TabField:
@@ -46,6 +43,11 @@ def solve(problem: FieldProblem) -> TabField:
 
 
 def _solve(problem: FieldProblem) -> TabField:
+    if problem.constraints:
+        from tab_marl.field.dual import fit_soft
+
+        chain, tilt, flux, report = fit_soft(problem, message)
+        return TabField(problem, chain, tilt, flux, report.worst, report.passes, report)
     tilt = Tilt.of(problem)
     if not tilt.needed:
         return TabField(problem, message(problem, tilt), tilt, None, 0.0, 1)
@@ -102,6 +104,15 @@ def message(problem: FieldProblem, tilt: Tilt) -> ProductChain:
     weight = np.exp(tilt.log_weight())
     transient = np.setdiff1d(np.arange(count), [automaton.accepting, automaton.rejecting, automaton.initial])
     order = transient[np.argsort(-automaton.rank[transient], kind="stable")].astype(np.int32)
+    over = np.asarray(problem.status)[order] != UNDER_WAY
+    norm = value
+    if over.any():  # events are still watched after the mission's end: the reference goes on, scaled to sum to 1
+        norm = value.copy()
+        tracking_kernels.backward_free(
+            order[over], motion.motion, problem.reference_of, problem.labels, automaton.delta, weight,
+            peak, value, norm, log_scale,
+        )  # fmt: skip
+        order = order[~over]
     kernels.backward(
         order, motion.motion, problem.reference_of, problem.labels, automaton.delta, weight,
         peak, value, log_scale,
@@ -115,7 +126,11 @@ def message(problem: FieldProblem, tilt: Tilt) -> ProductChain:
         motion, np.asarray(problem.labels), automaton, np.asarray(problem.start), value,
         centres=None if grid is None else grid.centres, cell_metres=1.0 if grid is None else grid.cell_metres,
         reference_of=problem.reference_of, weight=weight, log_scale=log_scale, harmonic=True,
+        complete=np.asarray(problem.status) == COMPLETE,
     )  # fmt: skip
+    if norm is not value:
+        norm[order] = value[order]
+        chain = chain._replace(norm=norm)
     feasible = np.isfinite(start_log_partition(chain))
     if not feasible.any():
         raise InfeasibleField(

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from tab_marl.field.constraints import Tilt
     from tab_marl.field.problem import FieldProblem
+    from tab_marl.field.report import FitReport
 
 Floats = NDArray[np.float64]
 
@@ -40,6 +41,8 @@ class TabField:
     """Largest relative error of a constrained expectation; 0 if there was nothing to fit."""
     rounds: int
     """Backward passes made."""
+    report: FitReport | None = None
+    """How well soft constraints hold; None without any."""
 
     @property
     def chain(self) -> ProductChain:
