@@ -212,7 +212,7 @@ def _pack_map(part: Parts, pools: dict[str, _Pool], number: NDArray[np.int64], f
     number[k.OBSTACLES] = len(scenario.obstacles)
     number[k.SUBSTEPS] = scenario.physics_hertz // scenario.control_hertz
     for region in regions:
-        disc, planes, corners = _outline(region)
+        disc, planes, corners = outline(region)
         pools["disc"].add(disc, 1, disc)
         pools["region_centre"].add(np.array(region.centre), 1, disc)
         pools["region_reach"].add(np.array([_reach(region)]), 1, disc)
@@ -239,7 +239,7 @@ def _fill_real(part: Parts, real: NDArray[np.float64]) -> None:
     real[k.ARRIVAL_FRACTION] = latents.arrival_fraction
 
 
-def _outline(region: Region) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def outline(region: Region) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """A region as a disc row (is disc, x, y, radius), or as sides: outward half-planes ``[V, 3]`` and ends ``[V, 4]``."""
     if isinstance(region, Disc):
         return np.array([1.0, region.x, region.y, region.radius]), np.zeros((0, 3)), np.zeros((0, 4))
