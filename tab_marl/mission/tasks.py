@@ -71,7 +71,7 @@ def sample_task(
     """Draw a task. `slack` None draws it uniformly from SLACK_RANGE. Raises UnknownName for a wrong id or family.
 
     `scenario`: the map, where it is not to be drawn; goals, starts and deadlines still are. `far_metres`: between the
-    adversary's start and its first goal, and between the two starts, at least.
+    adversary's start and its first goal, and between the two starts, at least; on a given map as far as there is room.
     """
     if mission_id not in MISSION_IDS:
         raise UnknownName("mission type", mission_id, MISSION_IDS)
@@ -79,11 +79,13 @@ def sample_task(
         raise UnknownName("scenario family", family, FAMILIES)
     if slack is not None and not slack > 1:
         raise ValueError(f"slack is {slack}, must be > 1 (allowed time / shortest time)")
-    for _ in range(MAPS):
+    for draw in range(MAPS):
         drawn = float(rng.uniform(*SLACK_RANGE)) if slack is None else slack
         map_drawn = sample_scenario(rng, options, name=f"{mission_id}-{family}") if scenario is None else scenario
-        order = np.arange(len(map_drawn.checkpoints)) if scenario is None else _goal_order(rng, scenario, mission_id)
-        task = _attempt(rng, map_drawn, order, mission_id, family, drawn, far_metres)
+        order, far = np.arange(len(map_drawn.checkpoints)), far_metres
+        if scenario is not None:
+            order, far = _goal_order(rng, scenario, mission_id), far_metres * (1.0 - 0.8 * draw / MAPS)
+        task = _attempt(rng, map_drawn, order, mission_id, family, drawn, far)
         if task is not None:
             return task
     where = f"{MAPS} maps" if scenario is None else f"scenario {scenario.name!r} in {MAPS} draws"
@@ -181,20 +183,15 @@ def _legs(
 
 
 def _targets(rng: np.random.Generator, scenario: Scenario, count: int) -> tuple[Place, ...] | None:
-    """Bare target points, clear of checkpoints, obstacles, walls and the central zone; closer where there is no room."""
-    return _clear_targets(rng, scenario, count, 0.1) or _clear_targets(rng, scenario, count, 0.0)
-
-
-def _clear_targets(rng: np.random.Generator, scenario: Scenario, count: int, margin: float) -> tuple[Place, ...] | None:
-    """Targets with so many metres more than needed between their discs and everything else."""
+    """Bare target points, clear of checkpoints, obstacles, walls and the central zone."""
     radius = scenario.target_radius_metres
     grid = GridMap.from_scenario(scenario, PLANNING_CELL_METRES)
-    ok = scenario.region("central zone").distance(grid.centres) >= radius + margin
+    ok = scenario.region("central zone").distance(grid.centres) >= radius + 0.1
     for c in scenario.checkpoints:
-        ok &= c.region.distance(grid.centres) >= radius + margin + 0.05
+        ok &= c.region.distance(grid.centres) >= radius + 0.15
     if radius < scenario.interception_metres:  # a wide target may reach under an obstacle, a small one may not
         for obstacle in scenario.obstacles:
-            ok &= obstacle.distance(grid.centres) >= radius + margin + 0.005
+            ok &= obstacle.distance(grid.centres) >= radius + 0.105
     chosen: list[Place] = []
     for _ in range(count):
         candidates = np.flatnonzero(ok)
