@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from tab_marl.planning.belief import BeliefDepleted, update_particles
 from tab_marl.planning.model import CompiledModel, Particles, PythonModel, table_model
-from tab_marl.planning.pomcp import Plan, Pomcp, PomcpOptions
+from tab_marl.planning.plan import Plan
+from tab_marl.planning.pomcp import Pomcp, PomcpOptions
 from tab_marl.planning.tree import SearchTree
 
 __all__ = [

@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tab_marl.planning.growing import merged, particle_blocks, shares
 from tab_marl.planning.kernels import NO_CHILD, UNEXPANDED
-from tab_marl.planning.model import CompiledModel, Particles, belief_states, check_weights, draw_particles
+from tab_marl.planning.model import CompiledModel, Particles, belief_states, check_weights
+from tab_marl.planning.plan import Search
 from tab_marl.planning.tree import EDGE, NODE, ROOT, SearchTree
 
 if TYPE_CHECKING:
@@ -55,10 +57,10 @@ def asked_prior(
 class _CompiledAsPython:
     """A compiled model's functions, interpreted, with the random numbers that the kernel would give them."""
 
-    def __init__(self, model: CompiledModel, options: PomcpOptions, belief: Any, rng: np.random.Generator) -> None:
+    def __init__(self, model: CompiledModel, count: int, common: bool, belief: Any, rng: np.random.Generator) -> None:
         self.model = model
-        self.states, self.weights = belief_states(model, belief, options.simulations, rng)
-        shared = len(self.states) if options.common_random_numbers else 0
+        self.states, self.weights = belief_states(model, belief, count, rng)
+        shared = len(self.states) if common else 0
         words = rng.integers(2**64, size=2 + shared, dtype=np.uint64)
         self.stream, self.word, self.seeds = _Stream(int(words[0])), words[1:2], words[2:]
         self.has_rollout, self.has_prior = model.rollout is not None, model.prior is not None
@@ -88,13 +90,13 @@ class _CompiledAsPython:
 class _PythonModel:
     """A model that is a Python class; states are whatever it likes."""
 
-    def __init__(self, model: Any, options: PomcpOptions, belief: Any, rng: np.random.Generator) -> None:
+    def __init__(self, model: Any, count: int, common: bool, belief: Any, rng: np.random.Generator) -> None:
         self.model = model
         weights = None
         if isinstance(belief, Particles):
             belief, weights = belief.states, belief.weights
         elif callable(belief):
-            belief = belief(options.simulations, rng)
+            belief = belief(count, rng)
         self.states = list(belief)
         if not self.states:
             raise ValueError(
@@ -103,7 +105,7 @@ class _PythonModel:
         self.weights = check_weights(weights, len(self.states))
         self.stream = _Stream(int(rng.integers(2**64, dtype=np.uint64)))
         self.rng = np.random.default_rng(int(rng.integers(2**63)))
-        shared = len(self.states) if options.common_random_numbers else 0
+        shared = len(self.states) if common else 0
         self.seeds = rng.integers(2**63, size=shared)
         self.has_rollout, self.has_prior = hasattr(model, "rollout"), hasattr(model, "prior")
 
@@ -190,28 +192,42 @@ class _Growing:
 
 def grow_tree_in_python(
     model: Any, options: PomcpOptions, belief: Any, rng: np.random.Generator, start: SearchTree
-) -> tuple[SearchTree, int, int, int]:
-    """(tree, simulations run, steps of the longest simulation in the tree, calls of step)."""
+) -> Search:
+    """The search, interpreted; workers take turns."""
+    shared = shares(options.simulations, options.max_nodes, options.workers, rng)
+    return merged([_grown(model, options, belief, *share, start) for share in shared], start, options.max_nodes)
+
+
+def _grown(
+    model: Any,
+    options: PomcpOptions,
+    belief: Any,
+    simulations: int,
+    max_nodes: int,
+    rng: np.random.Generator,
+    start: SearchTree,
+) -> Search:
     numbered = isinstance(model, CompiledModel)
-    source = (_CompiledAsPython if numbered else _PythonModel)(model, options, belief, rng)
-    tree, horizon = _Growing(start), options.horizon
-    tree_depth = horizon if options.tree_depth is None else options.tree_depth
-    most = max(len(start), min(options.max_nodes, options.simulations + len(start)))
+    source = (_CompiledAsPython if numbered else _PythonModel)(
+        model, simulations, options.common_random_numbers, belief, rng
+    )
+    tree = _Growing(start)
+    most = max(len(start), min(max_nodes, simulations + len(start)))
     deadline = None if options.seconds is None else time.perf_counter() + options.seconds
     done = deepest = steps = 0
-    while done < options.simulations:
-        left = options.simulations - done
-        chunk = left if deadline is None else min(16, left)
+    timed_out = False
+    for block in particle_blocks(simulations, len(source.states), source.weights, rng):
         with np.errstate(over="ignore"):  # a model's random words wrap round
-            for particle in draw_particles(chunk, len(source.states), source.weights, rng).tolist():
-                depth, path_length = _simulate(
-                    tree, source, particle, options, horizon, tree_depth, most, model.actions
-                )
-                deepest, steps = max(deepest, depth), steps + path_length
-        done += chunk
-        if deadline is not None and time.perf_counter() >= deadline:
+            for particle in block.tolist():
+                depth, path_length = _simulate(tree, source, particle, options, most, model.actions)
+                deepest, steps, done = max(deepest, depth), steps + path_length, done + 1
+                timed_out = deadline is not None and done < simulations and time.perf_counter() >= deadline
+                if timed_out:
+                    break
+        if timed_out:
             break
-    return tree.finished(numbered), done, deepest, steps
+    grown = tree.finished(numbered)
+    return Search(grown, done, deepest, steps, "seconds" if timed_out else "simulations", len(grown) >= max_nodes)
 
 
 def _simulate(
@@ -219,11 +235,10 @@ def _simulate(
     source: Any,
     particle: int,
     options: PomcpOptions,
-    horizon: int,
-    tree_depth: int,
     most: int,
     actions: int,
 ) -> tuple[int, int]:
+    horizon, tree_depth = options.horizon, options.deepest_node
     room = len(tree.seen) < most
     state = source.start(particle)
     node, action, path, leaf, seen = ROOT, -1, list[tuple[int, float]](), 0.0, None

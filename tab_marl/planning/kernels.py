@@ -20,7 +20,6 @@ from tab_marl.planning.random_kernels import GOLDEN, below, mixed
 NO_CHILD = -1
 NO_SIBLING = -1
 UNEXPANDED = -1
-FORBIDDEN = -1
 
 # What `used` counts.
 NODES, EDGES, DEEPEST, TREE_STEPS, ROLLOUT_STEPS = 0, 1, 2, 3, 4
@@ -95,12 +94,71 @@ def expand(
 
 
 @njit(cache=True, nogil=True)
-def find_child(nodes, edges, edge, observation):
-    """The node reached by this edge and observation, or NO_CHILD."""
-    child = edges[edge]["child"]
-    while child >= 0 and nodes[child]["observation"] != observation:
-        child = nodes[child]["sibling"]
-    return child
+def slot_of(edge, observation, size):
+    """Where the search for (edge, observation) starts in a table of `size` slots, a power of two."""
+    key = np.uint64(observation) ^ (np.uint64(edge) * GOLDEN)
+    return np.int64(np.uint64(mixed(key)) & np.uint64(size - 1))
+
+
+@njit(cache=True, nogil=True)
+def enter(nodes, parents, table, node):
+    """Puts the node into the table by which `find_child` finds children of edges that have many."""
+    size = len(table)
+    slot = slot_of(parents[node], nodes[node]["observation"], size)
+    while table[slot] >= 0:
+        slot = (slot + 1) & (size - 1)
+    table[slot] = node
+
+
+@njit(cache=True, nogil=True)
+def find_child(nodes, edges, parents, table, edge, observation):
+    """The node reached by this edge and observation, or NO_CHILD: from the table if there is one, else along the siblings.
+
+    Most problems have a few observations, whose nodes lie close together; some (LaserTag) have thousands, and a walk would be
+    quadratic. A table in the one kernel would cost the others a third of their speed, so it is compiled in only where it is given.
+    """
+    if table is None:
+        child = edges[edge]["child"]
+        while child >= 0 and nodes[child]["observation"] != observation:
+            child = nodes[child]["sibling"]
+        return child
+    else:
+        size = len(table)
+        slot = slot_of(edge, observation, size)
+        while table[slot] >= 0:
+            candidate = table[slot]
+            if parents[candidate] == edge and nodes[candidate]["observation"] == observation:
+                return candidate
+            slot = (slot + 1) & (size - 1)
+        return np.int32(NO_CHILD)
+
+
+@njit(cache=True, nogil=True)
+def most_children(nodes, edges):
+    """The most children that an edge of the root has."""
+    most = 0
+    for edge in range(nodes[0]["first_edge"], nodes[0]["first_edge"] + nodes[0]["edge_count"]):
+        count = 0
+        child = edges[edge]["child"]
+        while child >= 0:
+            count += 1
+            child = nodes[child]["sibling"]
+        most = max(most, count)
+    return most
+
+
+@njit(cache=True, nogil=True)
+def enter_all(nodes, edges, edge_count, node_count, parents, table):
+    """Fills `parents` [nodes] (NO_CHILD at the root) and the table anew."""
+    table[:] = NO_CHILD
+    parents[0] = NO_CHILD
+    for edge in range(edge_count):
+        child = edges[edge]["child"]
+        while child >= 0:
+            parents[child] = edge
+            child = nodes[child]["sibling"]
+    for node in range(1, node_count):
+        enter(nodes, parents, table, node)
 
 
 @njit(cache=True, nogil=True)
@@ -121,7 +179,7 @@ def random_rollout(step, data, state, depth, max_depth, discount, actions, rng, 
 @njit(cache=True, nogil=True)
 def search(
     step, rollout, prior, data, states, particles, seeds, actions, exploration, discount, max_depth, tree_depth,
-    may_grow, nodes, edges, edge_actions, used, root_log, inverse_root, rng, model_rng, state, path_edges, path_rewards, values, counts,
+    may_grow, nodes, edges, edge_actions, parents, table, used, root_log, inverse_root, rng, model_rng, state, path_edges, path_rewards, values, counts,
 ):  # fmt: skip
     """Simulations from `particles` [n] (rows of `states` [P, D]) until done or until the arrays are full and may grow.
 
@@ -160,7 +218,7 @@ def search(
             leaf_needed = False
             if terminal or depth == max_depth:
                 break
-            child = find_child(nodes, edges, edge, observation)
+            child = find_child(nodes, edges, parents, table, edge, observation)
             leaf_needed = True
             if child < 0:
                 if room and depth <= tree_depth:
@@ -172,6 +230,9 @@ def search(
                     nodes[child]["first_edge"] = UNEXPANDED
                     nodes[child]["edge_count"] = 0
                     edges[edge]["child"] = child
+                    if table is not None:
+                        parents[child] = edge
+                        enter(nodes, parents, table, child)
                 break
             if nodes[child]["first_edge"] == UNEXPANDED:
                 # Edges are made at the second visit: most nodes are visited once, and memory is what large trees wait for.

@@ -24,9 +24,10 @@ and C-contiguous. `rng` is uint64[1] for `tab_marl.planning.random_kernels`. Ret
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numba
@@ -104,6 +105,28 @@ def check_actions(actions: int, names: tuple[str, ...]) -> None:
         raise ValueError(f"actions is {actions}, must be >= 1")
     if names and len(names) != actions:
         raise ValueError(f"action_names has {len(names)} names for {actions} actions: give one each, or none")
+
+
+def check_model(model: Any) -> None:
+    """Raises TypeError when this is no model, ValueError when its actions are wrong."""
+    if not callable(getattr(model, "step", None)) or not hasattr(model, "actions"):
+        raise TypeError(f"the model, a {type(model).__name__}, needs `actions` and `step`: see tab_marl.planning.model")
+    check_actions(model.actions, tuple(getattr(model, "action_names", ())))
+
+
+class PlainPythonWarning(UserWarning):
+    """A model is searched in plain Python."""
+
+
+@cache
+def warn_of_plain_python(kind: type) -> None:
+    """Says once per class of model that it is slow, and what to do."""
+    warnings.warn(
+        f"{kind.__name__} is a model in plain Python: every step is interpreted, a hundred to a thousand times slower than "
+        "compiled. Once it is right, write its step as a function for CompiledModel, or give table_model its tables",
+        PlainPythonWarning,
+        stacklevel=4,
+    )
 
 
 def _plain(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -8,8 +8,7 @@ import numba
 import numpy as np
 import pytest
 
-from tab_marl.planning import pomcp as pomcp_module
-from tab_marl.planning import textbook
+from tab_marl.planning import growing, textbook
 from tab_marl.planning.model import CompiledModel, Particles, table_model
 from tab_marl.planning.pomcp import Pomcp, PomcpOptions
 from tab_marl.planning.random_kernels import uniform
@@ -217,7 +216,7 @@ def test_the_tree_does_not_depend_on_how_often_the_arrays_grew(monkeypatch):
     model, belief = textbook.tag(), textbook.TagBelief(4).sample(300, np.random.default_rng(0))
     options = PomcpOptions(simulations=900)
     whole = Pomcp(model, options).plan(belief, 8)
-    monkeypatch.setattr(pomcp_module, "_FIRST_NODES", 3)
+    monkeypatch.setattr(growing, "_FIRST_NODES", 3)
     assert same_tree(Pomcp(model, options).plan(belief, 8).tree, whole.tree)
 
 

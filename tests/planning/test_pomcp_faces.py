@@ -186,7 +186,9 @@ def test_a_plain_python_model_agrees_with_the_compiled_one():
     plain = Pomcp(PlainTiger(), options).plan(["left", "right"], 0)
     compiled = Pomcp(textbook.tiger(), options).plan([0.0, 1.0], 0)
     assert plain.action == compiled.action == 0
-    assert plain.values == pytest.approx(compiled.values, abs=12.0)
+    assert plain.values[0] == pytest.approx(compiled.values[0], abs=1.0)
+    # tried some 400 times, for returns between -200 and 20
+    assert plain.values == pytest.approx(compiled.values, abs=18.0)
     assert {plain.tree.observation(c) for c in plain.tree.children(0)} == {"hear left", "hear right"}
     assert "sees hear" in plain.explain()
 

@@ -1,0 +1,30 @@
+"""Checks and horizons that the options of every search share."""
+
+from __future__ import annotations
+
+import math
+
+PRECISION = 0.01
+"""Without `max_depth`: the weight of a reward beyond the horizon."""
+
+
+def require(condition: bool, name: str, value: object, bound: str) -> None:
+    """ValueError naming the field, its value and its bounds unless the condition holds."""
+    if not condition:
+        raise ValueError(f"{name} is {value!r}, must be {bound}")
+
+
+def check_horizon(discount: float, max_depth: int | None, tree_depth: int | None) -> None:
+    """ValueError unless rewards are summed over finitely many steps."""
+    require(0 < discount <= 1, "discount", discount, "in (0, 1]")
+    if discount == 1 and max_depth is None:
+        raise ValueError("discount is 1 and max_depth is None: give max_depth, or rewards would be summed forever")
+    require(max_depth is None or max_depth >= 1, "max_depth", max_depth, ">= 1")
+    require(tree_depth is None or tree_depth >= 0, "tree_depth", tree_depth, ">= 0")
+
+
+def horizon_of(discount: float, max_depth: int | None) -> int:
+    """`max_depth`, or the depth that the discount implies."""
+    if max_depth is not None:
+        return max_depth
+    return max(1, math.ceil(math.log(PRECISION) / math.log(discount)))

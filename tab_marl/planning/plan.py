@@ -1,0 +1,143 @@
+"""What every planner returns: the action to take, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tab_marl.planning.model import action_names
+from tab_marl.planning.tree import ROOT, SearchTree
+
+Stopped: TypeAlias = Literal["simulations", "seconds", "closed", "full"]
+"""Why a search ended: its budget of simulations or of seconds; its bounds met (DESPOT); its memory (DESPOT)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """The action to take, and why."""
+
+    action: int
+    values: NDArray[np.float64]
+    """``[A]`` mean return of each action at the root (DESPOT: its lower bound); -inf where not allowed or not tried."""
+    visits: NDArray[np.int64]
+    """``[A]`` simulations (and pseudo-counts) of each action (DESPOT: scenarios)."""
+    simulations: int
+    """Simulations run (DESPOT: trials)."""
+    depth: int
+    """Steps of the longest simulation inside the tree."""
+    steps: int
+    """Calls of the model's step function (those inside a rollout of the model's own are not seen)."""
+    seconds: float
+    tree: SearchTree
+    names: tuple[str, ...]
+    """``[A]`` of the actions."""
+    stopped: Stopped = "simulations"
+    """Why the search ended."""
+    full: bool = False
+    """Whether the cap on nodes was reached."""
+    bounds: tuple[float, float] | None = None
+    """Of the root's value over the scenarios (lower, upper), where the search keeps bounds."""
+
+    def best_line(self) -> list[tuple[str, object]]:
+        """What the plan expects: best action, commonest observation, best action after it, ..."""
+        return [(self.names[action], observation) for action, observation in self.tree.best_line()]
+
+    def table(self) -> str:
+        """Actions with value, standard of trial and share of simulations, best first, as text."""
+        width = max(6, *(len(name) for name in self.names))
+        total = max(1, int(self.visits.sum()))
+        rows = [f"  {'action':<{width}}  {'value':>10}  {'visits':>8}  share"]
+        for a in sorted(range(len(self.names)), key=lambda a: (-self.values[a], a)):
+            if self.visits[a] > 0:
+                mark = "*" if a == self.action else " "
+                rows.append(
+                    f"{mark} {self.names[a]:<{width}}  {self.values[a]:>10.3f}  {self.visits[a]:>8d}  "
+                    f"{self.visits[a] / total:>5.1%}"
+                )
+        return "\n".join(rows)
+
+    def explain(self) -> str:
+        """The table, the best line and the size of the search, as text."""
+        line = " > ".join(name if seen is None else f"{name} (sees {seen})" for name, seen in self.best_line())
+        return (
+            f"{self.table()}\nbest line: {line}\n"
+            f"{self.simulations} simulations in {self.seconds * 1000:.1f} ms, {len(self.tree)} nodes, {self.depth} steps deep"
+        )
+
+    def __str__(self) -> str:
+        return self.explain()
+
+
+class Planner(Protocol):
+    """What `Pomcp`, `Pomcpow` and `Despot` have in common."""
+
+    def plan(
+        self,
+        belief: ArrayLike | Callable[[int, np.random.Generator], ArrayLike] | Any,
+        rng: np.random.Generator | int,
+        *,
+        allowed: ArrayLike | None = None,
+    ) -> Plan:
+        """The plan from `belief`, the same for the same seed; `allowed` restricts the first action."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """A tree and how it came about, before anything is read from it."""
+
+    tree: SearchTree
+    simulations: int
+    depth: int
+    steps: int
+    stopped: Stopped = "simulations"
+    full: bool = False
+    bounds: tuple[float, float] | None = None
+
+
+def decided(search: Search, model: Any, choose: Literal["value", "visits"], seconds: float) -> Plan:
+    """The plan that a search's root holds: greatest value (ties: visits, then the lower number), or the other way round.
+
+    Raises ValueError when a value is not finite: the model's rewards or rollouts are not.
+    """
+    tree, actions = search.tree, model.actions
+    values = np.full(actions, -np.inf)
+    visits = np.zeros(actions, dtype=np.int64)
+    at_root = tree.edges[: tree.nodes["edge_count"][ROOT]]
+    chosen = tree.edge_actions[: len(at_root)]
+    visits[chosen] = at_root["visits"]
+    values[chosen] = np.where(at_root["visits"] > 0, at_root["value"], -np.inf)
+    broken = (visits > 0) & ~np.isfinite(values)
+    if broken.any():
+        action = int(np.argmax(broken))
+        raise ValueError(
+            f"action {action} has value {values[action]}: the model's rewards or rollouts are not all finite"
+        )
+    keys = (values, visits) if choose == "value" else (visits, values)
+    best = np.flatnonzero(keys[0] == keys[0].max())
+    action = int(best[np.argmax(keys[1][best])])
+    return Plan(
+        action, values, visits, search.simulations, search.depth, search.steps, seconds, tree, action_names(model),
+        search.stopped, search.full, search.bounds,
+    )  # fmt: skip
+
+
+def action_numbers(actions: int, allowed: ArrayLike | None) -> NDArray[np.int64]:
+    """Action numbers, ascending, from action numbers, a mask, or None for all; ValueError when none or out of bounds."""
+    if allowed is None:
+        return np.arange(actions)
+    chosen = np.asarray(allowed)
+    if chosen.dtype == np.bool_:
+        if chosen.shape != (actions,):
+            raise ValueError(f"allowed has shape {chosen.shape}, must be bool[{actions}] or action numbers")
+        chosen = np.flatnonzero(chosen)
+    chosen = np.unique(chosen.astype(np.int64))
+    if len(chosen) == 0:
+        raise ValueError("allowed names no action: at least one must be allowed")
+    if chosen[0] < 0 or chosen[-1] >= actions:
+        raise ValueError(f"allowed holds {chosen[0]}..{chosen[-1]}, must be in 0..{actions - 1}")
+    return chosen
