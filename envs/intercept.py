@@ -1,43 +1,40 @@
 """The interception environment: PettingZoo's ParallelEnv around an Episode. Glue only; every part is a module beside it.
 
-Agents are ``ego_0`` and ``adversary_0``; both act in ``[-1, 1]^2``: ``a[0]`` is the speed, from -1 (stand still) to 1
-(top speed), ``a[1]`` the turn rate, from -1 (clockwise at the top rate) to 1. Values beyond are clipped; NaN and
-infinities are refused. One step is one control step (0.1 s, ten physics substeps). An episode ends at interception
-(terminated) or at the horizon (truncated); with `end_on_completion` also when the mission is completed or fails. Where the
-ego's task is avoidance (`Scenario.ego_task`), it ends when the robots meet or the ego is in its goal; surveillance runs to
-the horizon.
+Agents are ``ego_0`` and ``adversary_0``. What they do and what is refused: `actions`. One step is one control step (0.1 s,
+ten physics substeps). An episode ends at interception (terminated) or at the horizon (truncated); with `end_on_completion`
+also when the mission is completed or fails. Where the ego's task is avoidance (`Scenario.ego_task`), it ends when the robots
+meet or the ego is in its goal; surveillance runs to the horizon.
+
+An environment can be deep-copied and pickled in mid-episode, and the copy goes on exactly as the original would: its physics
+is restored by replaying the episode's commands (`physics.Arena`). Windows and overlays do not travel.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Discrete
 from numpy.typing import ArrayLike, NDArray
 from pettingzoo import ParallelEnv
 
+from tab_marl.envs.actions import COMMANDS, ActionKind, action_space, check_kind
 from tab_marl.envs.adversary_side import AdversarySide, adversary_space, as_style, notices_ego
 from tab_marl.envs.ego_observation import Row, box_of, ego_rows, ego_space, observe_ego, robot_rows, robot_values
 from tab_marl.envs.episode import Episode, check_start, draw_starts
-from tab_marl.envs.heat import HeatSource, heat_source
 from tab_marl.envs.lidar import Lidar
-from tab_marl.envs.mission_scene import mission_scene
+from tab_marl.envs.pictures import FRAMES_PER_SECOND, RENDER_MODES, Pictures
 from tab_marl.envs.reward import AdversaryRewards, Events, adversary_reward, ego_reward
 from tab_marl.envs.styles import Style
-from tab_marl.envs.task_source import TaskSource, task_source
-from tab_marl.mission import Mission, to_english
+from tab_marl.envs.task_source import TaskSource, at_difficulty, difficulty_of, largest_task, task_source
+from tab_marl.mission import Mission
+from tab_marl.mission.curriculum import Curriculum
 from tab_marl.mission.tasks import Task
-from tab_marl.world.scenario import Robot, Scenario
-
-if TYPE_CHECKING:
-    from tab_marl.envs.live_view import LiveView
+from tab_marl.world.scenario import EgoTask, Scenario
 
 EGO_AGENT, ADVERSARY_AGENT = "ego_0", "adversary_0"
 AGENTS = (EGO_AGENT, ADVERSARY_AGENT)
-RENDER_MODES = ("human", "rgb_array")
 
 Observations = dict[str, NDArray[np.float32]]
 Infos = dict[str, dict[str, Any]]
@@ -49,7 +46,7 @@ class InterceptEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
     metadata: ClassVar[dict[str, Any]] = {
         "name": "tab_marl_intercept_v0",
         "render_modes": list(RENDER_MODES),
-        "render_fps": 10,
+        "render_fps": FRAMES_PER_SECOND,
         "is_parallelizable": True,
     }
 
@@ -66,16 +63,22 @@ class InterceptEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
         max_cycles: int | None = None,
         adversary_rewards: AdversaryRewards | None = None,
         show_lidar: bool = False,
+        actions: ActionKind = "continuous",
+        ego_task: EgoTask | None = None,
+        adversary_sees_ego_metres: float | None = None,
+        sampled: bool = False,
+        difficulty: float | None = None,
+        curriculum: Curriculum | None = None,
     ) -> None:
-        """`task`, `mission`, `scenario`, `family`: what is played, see `task_source`.
+        """`task`, `mission`, `scenario`, `family`, `sampled`, `difficulty`, `curriculum`, `ego_task` and
+        `adversary_sees_ego_metres`: what is played, see `task_source`.
 
         `adversary_style`: a Style or a style's name for the routes that the adversary observes; None is the direct one.
         `end_on_completion`: the episode also ends when the mission is completed or fails.
         `full_observation`: the ego sees the adversary always.
         `max_cycles`: the most control steps, if fewer than the horizon's.
+        `actions`: "continuous" or "discrete", for both agents.
         """
-        if render_mode is not None and render_mode not in RENDER_MODES:
-            raise ValueError(f"render_mode is {render_mode!r}, must be None or one of {list(RENDER_MODES)}")
         if max_cycles is not None and max_cycles < 1:
             raise ValueError(f"max_cycles is {max_cycles}, must be >= 1 or None (the scenario's horizon)")
         self.render_mode = render_mode
@@ -86,18 +89,19 @@ class InterceptEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
         self.adversary_rewards = adversary_rewards or AdversaryRewards()
         self.possible_agents = list(AGENTS)
         self.agents: list[str] = []
-        self._source = task_source(task, mission, scenario, family)
+        self._source = task_source(
+            task, mission, scenario, family, sampled=sampled, difficulty=difficulty, curriculum=curriculum,
+            ego_task=ego_task, adversary_sees_ego_metres=adversary_sees_ego_metres,
+        )  # fmt: skip
         self._rng = np.random.default_rng()
-        self._view: LiveView | None = None
-        self._show_lidar = show_lidar
-        self._heat_label = "belief"
+        self._pictures = Pictures("tab-marl: intercept", render_mode, show_lidar)
         self._episode: Episode | None = None
         self._over = False
         # The spaces come from a first task, drawn from a generator of its own so that episodes do not depend on it.
-        self._shape_of = self._source(np.random.default_rng(0)).scenario
-        self._heat: HeatSource = heat_source(None, self._shape_of)
+        self._shape_of = largest_task(self._source).scenario
+        self.action_kind = check_kind(actions)
         self.observation_spaces = {EGO_AGENT: ego_space(self._shape_of), ADVERSARY_AGENT: adversary_space()}
-        self.action_spaces = {agent: Box(-1.0, 1.0, (2,), dtype=np.float32) for agent in AGENTS}
+        self.action_spaces = {agent: action_space(self.action_kind) for agent in AGENTS}
         self.state_space = box_of(_state_rows(self._shape_of))
 
     @property
@@ -119,17 +123,30 @@ class InterceptEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
     def observation_space(self, agent: str) -> Box:
         return self.observation_spaces[agent]
 
-    def action_space(self, agent: str) -> Box:
+    def action_space(self, agent: str) -> Box | Discrete:
         return self.action_spaces[agent]
 
+    @property
+    def difficulty(self) -> float | None:
+        """At which tasks are drawn; None without a curriculum."""
+        return difficulty_of(self._source)
+
+    def set_difficulty(self, difficulty: float) -> None:
+        """Draw tasks at this difficulty (0..1) from the next reset on. Raises ValueError without a curriculum."""
+        self._source = at_difficulty(self._source, difficulty)
+
     def reset(self, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Observations, Infos]:
-        """Begin an episode. `options` may hold "task" (a Task), "ego_start" and "adversary_start" (x, y, theta);
-        other keys are ignored. The same seed, options and actions give the same episode.
+        """Begin an episode. `options` may hold "task" (a Task), "difficulty" (0..1, for this episode, where there is a
+        curriculum), "ego_start" and "adversary_start" (x, y, theta); other keys are ignored. The same seed, options and
+        actions give the same episode.
         """
         if seed is not None:
             self._rng = np.random.default_rng(seed)
         rng, options = self._rng, options or {}
-        task = options.get("task") or self._source(rng)
+        source = (
+            self._source if options.get("difficulty") is None else at_difficulty(self._source, options["difficulty"])
+        )
+        task = options.get("task") or source(rng)
         scenario: Scenario = task.scenario
         self._check_shape(scenario)
         given = {name: check_start(scenario, options[name], name) for name in ("ego_start", "adversary_start") if name in options}  # fmt: skip
@@ -144,8 +161,7 @@ class InterceptEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
         self._episode = Episode(task, self._side.monitor, *starts)
         self._over = False
         self.agents = list(AGENTS)
-        if self._view is not None:
-            self._start_view()
+        self._pictures.start(task)
         if self.render_mode == "human":
             self.render()
         return self._observe(), self._infos(Events())
@@ -160,9 +176,16 @@ class InterceptEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
                 return {}, {}, {}, {}, {}
             raise RuntimeError("the episode is over: call reset")
         scenario = episode.scenario
+        command = COMMANDS[self.action_kind]
+        try:
+            ego, adversary = actions[EGO_AGENT], actions[ADVERSARY_AGENT]
+        except KeyError as missing:
+            raise ValueError(
+                f"actions lack {missing.args[0]!r}: every living agent must act, got {sorted(actions)}"
+            ) from None
         events = episode.step(
-            _command(actions, EGO_AGENT, scenario.ego), _command(actions, ADVERSARY_AGENT, scenario.adversary)
-        )  # fmt: skip
+            command(ego, EGO_AGENT, scenario.ego), command(adversary, ADVERSARY_AGENT, scenario.adversary)
+        )
         ended = episode.ended or (self.end_on_completion and (events.completed or events.failed))
         truncated = not ended and episode.control_steps >= self._last_step
         seconds = self._control_seconds
@@ -201,36 +224,17 @@ class InterceptEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
         `field`: an image ``[rows, columns]`` (row 0 at the bottom), a pair (GridMap, values ``[cells]``), values
         ``[cells]`` on the scenario's grid of 0.1 or 0.05 m, or a function without arguments that returns one of these.
         """
-        self._heat = heat_source(field, self._shape_of if self._episode is None else self._episode.scenario)
-        self._heat_label = label
+        self._pictures.set_field(field, self._shape_of if self._episode is None else self._episode.scenario, label)
 
     def render(self) -> NDArray[np.uint8] | None:
         """The picture ``[height, width, 3]`` in mode "rgb_array"; None in mode "human", which shows it in a window."""
         if self.render_mode is None:
             raise RuntimeError(f"render() needs a render_mode: make the environment with one of {list(RENDER_MODES)}")
-        if self._view is None:
-            from tab_marl.envs.live_view import LiveView  # loads pygame
-
-            self._view = LiveView("tab-marl: intercept", self._show_lidar)
-            self._start_view()
-        frame = self._view.frame(self.episode, self._heat(), self._heat_label, self._over)
-        if self.render_mode == "rgb_array":
-            return self._view.array(frame)
-        self._view.show(frame, self.metadata["render_fps"])
-        return None
+        return self._pictures.draw(self.episode, self._over)
 
     def close(self) -> None:
         """Close the window, if there is one."""
-        if self._view is not None:
-            self._view.close()
-            self._view = None
-
-    def _start_view(self) -> None:
-        if self._view is not None:
-            task = self.task
-            self._view.start(
-                task.scenario, mission_scene(task.mission, task.scenario, to_english(task.mission, task.scenario))
-            )
+        self._pictures.close()
 
     def _observe(self) -> Observations:
         episode = self.episode
@@ -305,17 +309,3 @@ def _state_rows(scenario: Scenario) -> tuple[Row, ...]:
         rows["left"],
         Row("mission", -1.0, 1.0),
     )
-
-
-def _command(actions: Mapping[str, ArrayLike], agent: str, robot: Robot) -> tuple[float, float]:
-    """(v [m/s], w [rad/s]) of an agent's action."""
-    if agent not in actions:
-        raise ValueError(f"actions lack {agent!r}: every living agent must act, got {sorted(actions)}")
-    action = np.asarray(actions[agent])
-    if action.shape != (2,):
-        raise ValueError(f"the action of {agent!r} has shape {list(action.shape)}, must be [2] (speed, turn rate)")
-    speed, turn = action.tolist()
-    if not (math.isfinite(speed) and math.isfinite(turn)):
-        raise ValueError(f"the action of {agent!r} is {[speed, turn]}, must be finite numbers in [-1, 1]")
-    speed, turn = min(max(speed, -1.0), 1.0), min(max(turn, -1.0), 1.0)
-    return (0.5 * (speed + 1.0) * robot.max_speed, turn * robot.max_turn_rate)

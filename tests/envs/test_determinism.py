@@ -26,7 +26,7 @@ def episode(env: InterceptEnv, seed: int) -> list[Any]:
     record: list[Any] = [exact(observations), repr(infos)]
     while env.agents:
         observations, rewards, terminations, truncations, infos = env.step(
-            {agent: np.array([1.0, rng.normal(0.0, 0.4)]) for agent in env.agents}
+            {agent: np.array([1.0, np.clip(rng.normal(0.0, 0.4), -1.0, 1.0)]) for agent in env.agents}
         )
         record.append((exact(observations), repr((rewards, terminations, truncations, infos)), env.state().tobytes()))
     return record

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
 from collections.abc import Callable, Iterator
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import pettingzoo
 import pytest
+from gymnasium.spaces import Discrete
 from pettingzoo.test import (
     api_test,
     max_cycles_test,
@@ -22,6 +24,7 @@ from pettingzoo.test import (
 from pettingzoo.test.state_test import state_test
 
 from tab_marl.envs import intercept_v0, register_all
+from tab_marl.envs.actions import nearest_discrete
 from tab_marl.envs.intercept import InterceptEnv
 from tab_marl.envs.paper_missions import paper_mission
 from tab_marl.mission import MISSIONS, Mission, MissionSyntaxError, parse_mission
@@ -209,28 +212,56 @@ def test_reset_options(reach_a: Task) -> None:
 @pytest.mark.parametrize(
     ("action", "message"),
     [
-        (np.array([np.nan, 0.0]), r"'ego_0' is \[nan, 0.0\], must be finite"),
-        (np.array([0.0, np.inf]), "must be finite"),
-        (np.zeros(3), r"shape \[3\], must be \[2\]"),
+        (np.array([np.nan, 0.0]), r"'ego_0' is \[nan, 0.0\]: its speed must be a finite number in \[-1, 1\]"),
+        (np.array([0.0, np.inf]), "its turn rate must be a finite number"),
+        (np.array([0.5, -1.001]), r"'ego_0' is .*its turn rate -1.001 lies outside \[-1, 1\]; clip"),
+        (np.array([1e6, 0.0]), r"its speed 1e\+06 lies outside"),
+        (np.zeros(3), r"'ego_0' has shape \[3\], must be \[2\]"),
         (np.zeros((1, 2)), r"shape \[1, 2\], must be \[2\]"),
+        (np.array([True, False]), "dtype bool, must be two real numbers"),
+        (np.array(["1", "0"]), "dtype <U1, must be two real numbers"),
     ],
 )
 def test_bad_actions(reach_a: Task, action: np.ndarray, message: str) -> None:
     env = InterceptEnv(task=reach_a)
     env.reset(seed=0)
+    before = env.state()
     with pytest.raises(ValueError, match=message):
         env.step({"ego_0": action, "adversary_0": STILL})
+    with pytest.raises(ValueError, match=message.replace("ego_0", "adversary_0")):
+        env.step({"ego_0": STILL, "adversary_0": action})
+    assert np.array_equal(env.state(), before), "a refused step changes nothing"
 
 
-def test_actions_beyond_the_bounds_are_clipped(reach_a: Task) -> None:
+def test_rounding_beyond_the_bounds_is_forgiven(reach_a: Task) -> None:
     motions = []
-    for scale in (1.0, 1e6):
+    for beyond in (0.0, 5e-7):
         env = InterceptEnv(task=reach_a)
         env.reset(seed=0)
         for _ in range(5):
-            env.step({"ego_0": scale * np.array([1.0, -1.0]), "adversary_0": -scale * np.array([1.0, -1.0])})
+            corner = (1.0 + beyond) * np.array([1.0, -1.0])
+            env.step({"ego_0": corner, "adversary_0": -corner})
         motions.append(env.episode.motion)
     assert motions[0] == motions[1]
+
+
+def test_discrete_actions_are_a_table_of_continuous_ones(reach_a: Task) -> None:
+    discrete, continuous = InterceptEnv(task=reach_a, actions="discrete"), InterceptEnv(task=reach_a)
+    space = discrete.action_space("ego_0")
+    assert isinstance(space, Discrete) and space.n == 15
+    discrete.reset(seed=0), continuous.reset(seed=0)
+    for number, (speed, turn) in enumerate(itertools.product((0.0, 0.5, 1.0), (-1.0, -0.25, 0.0, 0.25, 1.0))):
+        same = np.array([2.0 * speed - 1.0, turn])
+        discrete.step({"ego_0": number, "adversary_0": np.int64(number)})
+        continuous.step({"ego_0": same, "adversary_0": same})
+        assert discrete.episode.motion == continuous.episode.motion
+        assert nearest_discrete(same.astype(np.float32)) == number
+    for wrong, message in ((15, r"'adversary_0' is 15, must lie in 0..14"), (-1, "is -1"), (1.0, "one whole number"),
+                           ([1, 2], "one whole number in 0..14"), (True, "whole number")):  # fmt: skip
+        with pytest.raises(ValueError, match=message):
+            discrete.step({"ego_0": 0, "adversary_0": wrong})
+    with pytest.raises(UnknownName, match="did you mean 'discrete'"):
+        InterceptEnv(actions="discret")  # type: ignore[arg-type]
 
 
 def test_misuse_is_told(reach_a: Task) -> None:
