@@ -1,0 +1,154 @@
+"""The exact belief over the states of a model given as tables, by Bayes' rule."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tab_marl.planning.filter_report import Deprivation, EventLog, FilterReport, ImpossibleObservation, named
+from tab_marl.planning.model import CompiledModel, Particles, TableData, action_names
+
+_LISTED = 5
+"""Observations that a message lists as possible."""
+
+
+@dataclass(eq=False)
+class ExactFilter:
+    """The probability of every state of a `table_model`, given what was done and seen. Used like `ParticleFilter`.
+
+    An observation of probability zero contradicts the tables. It is said what was seen and when (`BeliefWarning`, `report`), and
+    the belief is made anew: the history is replayed, forgiving, with weight `doubt`, states that do not explain what was seen;
+    where no state explains the latest observation, the `fallback` is believed. With `strict`, ImpossibleObservation is raised.
+    """
+
+    model: CompiledModel
+    prior: ArrayLike | None = None
+    """``[S]``, >= 0, of any scale; None: all states alike."""
+    strict: bool = False
+    doubt: float = 1e-3
+    """In a replay: how well a state that excludes an observation explains it, relative to the state that explains it best."""
+    fallback: Callable[[int, int], ArrayLike] | None = None
+    """``fallback(action, observation) -> probabilities [S]``; None: the prior, led through the last action."""
+    probabilities: NDArray[np.float64] = field(init=False)
+    """``[S]``: the belief."""
+
+    def __post_init__(self) -> None:
+        data = self.model.data
+        if not isinstance(data, TableData):
+            raise TypeError(
+                f"an exact filter needs tables, and this model's data is a {type(data).__name__}: see table_model"
+            )
+        if not 0 <= self.doubt <= 1:
+            raise ValueError(f"doubt is {self.doubt}, must be in [0, 1]")
+        size = len(data.terminal)
+        shape = (self.model.actions, size, -1)
+        # What the tables hold is cumulative.
+        self._transition = np.diff(data.transition.reshape(shape), axis=2, prepend=0.0)
+        self._observation = np.diff(data.observation.reshape(shape), axis=2, prepend=0.0)
+        self._goes_on = ~data.terminal
+        self._prior = self._distribution("prior", np.ones(size) if self.prior is None else self.prior)
+        self._names = action_names(self.model)
+        self._history: list[tuple[int, int]] = []
+        self._log = EventLog()
+        self.probabilities = self._prior
+
+    def predicted(self, action: int) -> NDArray[np.float64]:
+        """``[O]``: the probability of each observation after `action`, given that the process goes on."""
+        joint = self._moved(self.probabilities, action) @ self._observation[action]
+        return joint / max(joint.sum(), np.finfo(float).tiny)
+
+    def update(self, action: int, observation: int) -> ExactFilter:
+        """Takes the step in which `action` was done, `observation` seen, and the process did not end. Returns itself."""
+        if not 0 <= action < self.model.actions:
+            raise ValueError(f"action is {action}, must be in 0..{self.model.actions - 1}")
+        if not 0 <= observation < self._observation.shape[2]:
+            raise ValueError(f"observation is {observation}, must be in 0..{self._observation.shape[2] - 1}")
+        joint = self._moved(self.probabilities, action) * self._observation[action][:, observation]
+        if self.strict and not joint.sum() > 0:
+            raise ImpossibleObservation(self._event(action, observation, None, self._log.updates + 1))
+        self._log.updates += 1
+        self._log.least_effective = float(len(joint))
+        self._history.append((action, observation))
+        if joint.sum() > 0:
+            self.probabilities = joint / joint.sum()
+        else:
+            self._recover(action, observation)
+        return self
+
+    def sample(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+        """``[count, 1]`` states; hand this method to a planner as its belief."""
+        return rng.choice(len(self.probabilities), size=(count, 1), p=self.probabilities).astype(np.float64)
+
+    @property
+    def particles(self) -> Particles:
+        """The belief as a planner takes it, without drawing: every state with its probability."""
+        return Particles(np.arange(len(self.probabilities), dtype=np.float64), self.probabilities)
+
+    @property
+    def entropy(self) -> float:
+        """Of the belief, in nats."""
+        p = self.probabilities[self.probabilities > 0]
+        return float(-(p * np.log(p)).sum())
+
+    def report(self) -> FilterReport:
+        """What happened so far: updates, and every observation that the tables exclude."""
+        return self._log.report()
+
+    def _moved(self, belief: NDArray[np.float64], action: int) -> NDArray[np.float64]:
+        """``[S]`` unnormalised: the states reached from which the process goes on."""
+        moved: NDArray[np.float64] = (belief @ self._transition[action]) * self._goes_on
+        return moved
+
+    def _recover(self, action: int, observation: int) -> None:
+        replayed = self._replayed()
+        event = self._event(action, observation, "replay" if replayed is not None else "fallback", self._log.updates)
+        if replayed is not None:
+            self.probabilities = replayed
+        else:
+            self.probabilities = self._fallen_back(action, observation)
+            self._history, self._prior = [], self.probabilities
+        self._log.lost(event)
+
+    def _replayed(self) -> NDArray[np.float64] | None:
+        belief = self._prior
+        explained = False
+        for action, observation in self._history:
+            moved = self._moved(belief, action)
+            chance = self._observation[action][:, observation]
+            best = chance[moved > 0].max(initial=0.0)
+            explained = bool(best > 0)
+            belief = moved * np.maximum(chance, self.doubt * best) if explained else moved
+            if not belief.sum() > 0:
+                return None
+            belief = belief / belief.sum()
+        return belief if explained else None
+
+    def _fallen_back(self, action: int, observation: int) -> NDArray[np.float64]:
+        if self.fallback is not None:
+            return self._distribution("fallback", self.fallback(action, observation))
+        moved = self._moved(self._prior, action)
+        joint = moved * self._observation[action][:, observation]
+        for belief in (joint, moved):
+            if belief.sum() > 0:
+                return belief / belief.sum()
+        return self._prior
+
+    def _event(self, action: int, observation: int, remedy: Any, step: int) -> Deprivation:
+        chances = self.predicted(action)
+        likely = [o for o in np.argsort(-chances, kind="stable")[:_LISTED] if chances[o] > 0]
+        possible = ", ".join(f"{o} ({chances[o]:.3g})" for o in likely)
+        detail = (
+            f"probability 0; possible: {possible}" if likely else "probability 0; the process must have ended before"
+        )
+        return Deprivation(step, named(self._names, action), observation, remedy, detail)
+
+    def _distribution(self, name: str, given: ArrayLike) -> NDArray[np.float64]:
+        p = np.asarray(given, dtype=np.float64)
+        size = len(self._goes_on)
+        if p.shape != (size,) or not np.isfinite(p).all() or (p < 0).any() or not p.sum() > 0:
+            raise ValueError(f"{name} must be {size} numbers, finite, >= 0 and not all zero; its shape is {p.shape}")
+        return p / p.sum()

@@ -1,0 +1,115 @@
+"""How the particles of a filter move and are weighed, for each kind of model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numba
+import numpy as np
+from numba import typeof, types
+from numpy.typing import NDArray
+
+from tab_marl.planning import filter_kernels
+from tab_marl.planning.callbacks import callback
+from tab_marl.planning.model import CompiledModel, Particles, TableData, belief_states, check_weights, draw_particles
+
+_STATE = types.Array(types.float64, 1, "C")
+
+
+class ParticleDynamics(Protocol):
+    """What a particle filter asks of a model."""
+
+    weighs: bool
+    """Whether weights are likelihoods (True), or 1 where the simulated observation is the very one (False)."""
+
+    def draw(self, belief: Any, count: int, rng: np.random.Generator) -> NDArray[Any]:
+        """`count` equally weighted states of a belief."""
+        ...
+
+    def advance(
+        self, states: NDArray[Any], action: int, observation: Any, rng: np.random.Generator
+    ) -> tuple[NDArray[Any], NDArray[np.float64]]:
+        """(states after the step, weights); the weight of a state in which the process ended is -1."""
+        ...
+
+
+def dynamics_of(model: Any, likelihood: Callable[..., float] | None) -> ParticleDynamics:
+    """The dynamics of a compiled or a plain Python model; `likelihood` None takes the model's own if it has one."""
+    given = likelihood if likelihood is not None else getattr(model, "likelihood", None)
+    if isinstance(model, CompiledModel):
+        if given is None and isinstance(model.data, TableData):
+            given = filter_kernels.table_likelihood
+        return CompiledDynamics(model, given)
+    return PythonDynamics(model, given)
+
+
+class CompiledDynamics:
+    """Particles of a `CompiledModel`: rows of an array."""
+
+    def __init__(self, model: CompiledModel, likelihood: Callable[..., float] | None) -> None:
+        self.model = model
+        self.weighs = likelihood is not None
+        self._interpreted = bool(getattr(numba.config, "DISABLE_JIT", 0))
+        self._likelihood: Any = likelihood
+        if likelihood is not None and not self._interpreted:
+            plain = getattr(likelihood, "py_func", likelihood)
+            signature = types.float64(_STATE, types.int64, _STATE, types.int64, typeof(model.data))
+            self._likelihood = callback(plain, signature)
+
+    def draw(self, belief: Any, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+        states, weights = belief_states(self.model, belief, count, rng)
+        return states[draw_particles(count, len(states), weights, rng)]
+
+    def advance(
+        self, states: NDArray[np.float64], action: int, observation: Any, rng: np.random.Generator
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        word = rng.integers(2**64, size=1, dtype=np.uint64)
+        after, weights = np.empty_like(states), np.empty(len(states))
+        filter_kernels.advance(
+            self.model.functions[0], self._likelihood, self.model.data, states, int(action), int(observation), word,
+            np.empty(self.model.state_size), after, weights,
+        )  # fmt: skip
+        return after, weights
+
+
+class PythonDynamics:
+    """Particles of a plain Python model: an array of objects. Every step is interpreted."""
+
+    def __init__(self, model: Any, likelihood: Callable[..., float] | None) -> None:
+        self.model, self._likelihood = model, likelihood
+        self.weighs = likelihood is not None
+
+    def draw(self, belief: Any, count: int, rng: np.random.Generator) -> NDArray[Any]:
+        weights = None
+        if isinstance(belief, Particles):
+            belief, weights = belief.states, belief.weights
+        elif callable(belief):
+            belief = belief(count, rng)
+        states = _objects(list(belief))
+        if len(states) == 0:
+            raise ValueError("the belief is empty: give at least one state")
+        return states[draw_particles(count, len(states), check_weights(weights, len(states)), rng)]
+
+    def advance(
+        self, states: NDArray[Any], action: int, observation: Any, rng: np.random.Generator
+    ) -> tuple[NDArray[Any], NDArray[np.float64]]:
+        after, weights = list[Any](), np.empty(len(states))
+        for i, state in enumerate(states):
+            reached, seen, _reward, terminal = self.model.step(state, action, rng)
+            after.append(reached)
+            if terminal:
+                weights[i] = -1.0
+            elif self._likelihood is None:
+                weights[i] = float(seen == observation)
+            else:
+                weights[i] = self._likelihood(state, action, reached, observation)
+        return _objects(after), weights
+
+
+def _objects(states: list[Any]) -> NDArray[Any]:
+    """A one-dimensional array of objects, whatever they are."""
+    array = np.empty(len(states), dtype=object)
+    for i, state in enumerate(states):  # a slice would take tuples apart
+        array[i] = state
+    return array

@@ -1,0 +1,266 @@
+# mypy: ignore-errors
+"""RockSample (Smith and Simmons, UAI 2004) as compiled functions.
+
+The state is ``[cell, rocks that are good as bits, log odds that rock 0 is good, rock 1, ...]``. The log odds follow from what
+was done and seen alone (the readings of different rocks are independent), so a prior or a rollout may read them: they are the
+rover's own knowledge, not a look at the rocks. ``data.collected`` stands for a rock that was sampled.
+"""
+
+# mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators, no-check-untyped-defs
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from tab_marl.planning.random_kernels import below, uniform
+
+NORTH, EAST, SOUTH, WEST, SAMPLE, CHECK = 0, 1, 2, 3, 4, 5
+BAD, GOOD, NOTHING = 0, 1, 2
+COLLECTED = -1000.0
+"""Log odds of a rock that was sampled."""
+FIRST = 2
+"""Where the log odds begin in a state."""
+
+
+@njit(cache=True)
+def act(state, action, data, rng):
+    """One step on `state`; returns (observation, reward, terminal)."""
+    cell = np.int64(state[0])
+    if action < SAMPLE:
+        after = np.int64(data.moves[cell * 4 + action])
+        if after >= 0:
+            state[0] = after
+            return np.int64(NOTHING), 0.0, False
+        if action == EAST:
+            return np.int64(NOTHING), 10.0, True
+        return np.int64(NOTHING), -100.0, False
+    good = np.int64(state[1])
+    if action == SAMPLE:
+        rock = np.int64(data.rock_at[cell])
+        if rock < 0:
+            return np.int64(NOTHING), -100.0, False
+        bit = np.int64(1) << rock
+        reward = 10.0 if good & bit else -10.0
+        state[1] = good & ~bit
+        state[FIRST + rock] = COLLECTED
+        return np.int64(NOTHING), reward, False
+    rock = action - CHECK
+    right = uniform(rng) < data.accuracy[cell * data.rocks + rock]
+    is_good = (good >> rock) & 1
+    seen = is_good if right else 1 - is_good
+    if state[FIRST + rock] != COLLECTED:
+        evidence = data.evidence[cell * data.rocks + rock]
+        state[FIRST + rock] += evidence if seen == GOOD else -evidence
+    return np.int64(seen), 0.0, False
+
+
+def step(state, action, data, rng):
+    """One step of RockSample."""
+    return act(state, action, data, rng)
+
+
+def likelihood(before, action, state, observation, data):
+    """P(observation | action, state reached)."""
+    if action < CHECK:
+        return 1.0 if observation == NOTHING else 0.0
+    if observation == NOTHING:
+        return 0.0
+    rock = action - CHECK
+    right = data.accuracy[np.int64(state[0]) * data.rocks + rock]
+    return right if (np.int64(state[1]) >> rock) & 1 == observation else 1.0 - right
+
+
+def survey_rollout(state, action, observation, depth, max_depth, discount, data, rng):
+    """Go to the nearest rock that may be good, checking it on the way until sure; collect it; at last leave by the east.
+
+    "May be good" and "sure" are bounds on the log odds (``data.hope``, ``data.trust``), which is all that it reads of the
+    hidden state; what checks would show is drawn as in `act`.
+    """
+    cell = np.int64(state[0])
+    good = np.int64(state[1])
+    total = 0.0
+    weight = 1.0
+    left = max_depth - depth
+    while True:
+        nearest = -1
+        way = data.size * data.size
+        for rock in range(data.rocks):
+            distance = data.distance[cell * data.rocks + rock]
+            if state[FIRST + rock] > data.hope and distance < way:
+                way = distance
+                nearest = rock
+        if nearest < 0:
+            break
+        odds = state[FIRST + nearest]
+        if odds < data.trust and way > 0:
+            right = uniform(rng) < data.accuracy[cell * data.rocks + nearest]
+            seen_good = ((good >> nearest) & 1) == right
+            evidence = data.evidence[cell * data.rocks + nearest]
+            state[FIRST + nearest] = odds + (evidence if seen_good else -evidence)
+            weight *= discount
+            left -= 1
+            if left <= 0:
+                return total
+            continue
+        left -= way + 1
+        if left < 0:
+            return total
+        for _ in range(way):
+            weight *= discount
+        total += weight * (10.0 if (good >> nearest) & 1 else -10.0)
+        weight *= discount
+        state[FIRST + nearest] = COLLECTED
+        cell = data.rock_cell[nearest]
+    exit_way = data.size - cell % data.size
+    if left < exit_way:
+        return total
+    for _ in range(exit_way - 1):
+        weight *= discount
+    return total + 10.0 * weight
+
+
+def harvest_rollout(state, action, observation, depth, max_depth, discount, data, rng):
+    """Collect the nearest rock more likely good than not, and so on; then leave. No random number, no step by step."""
+    cell = np.int64(state[0])
+    good = np.int64(state[1])
+    taken = np.int64(0)
+    total = 0.0
+    weight = 1.0
+    left = max_depth - depth
+    while True:
+        nearest = -1
+        way = data.size * data.size
+        for rock in range(data.rocks):
+            if state[FIRST + rock] > 0.0 and not (taken >> rock) & 1:
+                distance = data.distance[cell * data.rocks + rock]
+                if distance < way:
+                    way = distance
+                    nearest = rock
+        if nearest < 0:
+            break
+        left -= way + 1
+        if left < 0:
+            return total
+        for _ in range(way):
+            weight *= discount
+        total += weight * (10.0 if (good >> nearest) & 1 else -10.0)
+        weight *= discount
+        taken |= np.int64(1) << nearest
+        cell = data.rock_cell[nearest]
+    exit_way = data.size - cell % data.size
+    if left < exit_way:
+        return total
+    for _ in range(exit_way - 1):
+        weight *= discount
+    return total + 10.0 * weight
+
+
+def legal_rollout(state, action, observation, depth, max_depth, discount, data, rng):
+    """Uniform among the actions that make sense anywhere, to the end: POMCP's rollout without further knowledge."""
+    total = 0.0
+    weight = 1.0
+    for _ in range(depth, max_depth):
+        cell = np.int64(state[0])
+        while True:
+            chosen = below(rng, CHECK + data.rocks)
+            if chosen < SAMPLE:
+                if chosen == EAST or data.moves[cell * 4 + chosen] >= 0:
+                    break
+            elif chosen == SAMPLE:
+                rock = np.int64(data.rock_at[cell])
+                if rock >= 0 and state[FIRST + rock] != COLLECTED:
+                    break
+            elif state[FIRST + chosen - CHECK] != COLLECTED:
+                break
+        _seen, reward, terminal = act(state, chosen, data, rng)
+        total += weight * reward
+        if terminal:
+            break
+        weight *= discount
+    return total
+
+
+@njit(cache=True)
+def forbid(state, data, counts):
+    """Sets the counts of actions that cannot pay to -1."""
+    cell = np.int64(state[0])
+    for a in range(SAMPLE):
+        if a != EAST and data.moves[cell * 4 + a] < 0:
+            counts[a] = -1
+    here = np.int64(data.rock_at[cell])
+    if here < 0 or state[FIRST + here] == COLLECTED:
+        counts[SAMPLE] = -1
+    for rock in range(data.rocks):
+        if abs(state[FIRST + rock]) > data.sure:
+            counts[CHECK + rock] = -1
+
+
+def sensible(state, action, observation, depth, data, values, counts):
+    """Forbids walking into the border, sampling where nothing is left, and checking rocks already known or collected."""
+    forbid(state, data, counts)
+
+
+@njit(cache=True)
+def expected_harvest(cell, state, data, changed, log_odds, discount):
+    """What `harvest_rollout` earns on average from `cell` by the rover's knowledge, with rock `changed`'s log odds replaced."""
+    taken = np.int64(0)
+    total = 0.0
+    weight = 1.0
+    while True:
+        nearest = -1
+        way = data.size * data.size
+        best = 0.0
+        for rock in range(data.rocks):
+            odds = log_odds if rock == changed else state[FIRST + rock]
+            if odds > 0.0 and not (taken >> rock) & 1:
+                distance = data.distance[cell * data.rocks + rock]
+                if distance < way:
+                    way = distance
+                    nearest = rock
+                    best = odds
+        if nearest < 0:
+            break
+        for _ in range(way):
+            weight *= discount
+        total += weight * 10.0 * (2.0 / (1.0 + np.exp(-best)) - 1.0)
+        weight *= discount
+        taken |= np.int64(1) << nearest
+        cell = data.rock_cell[nearest]
+    for _ in range(data.size - 1 - cell % data.size):
+        weight *= discount
+    return total + 10.0 * weight
+
+
+def informed(state, action, observation, depth, data, values, counts):
+    """`sensible`, and each remaining action starts as if tried: its reward and the expected harvest one step on."""
+    forbid(state, data, counts)
+    cell = np.int64(state[0])
+    discount = data.discount
+    for a in range(len(counts)):
+        if counts[a] < 0:
+            continue
+        counts[a] = data.prior_count
+        if a < SAMPLE:
+            after = np.int64(data.moves[cell * 4 + a])
+            if after < 0:
+                values[a] = 10.0
+            else:
+                values[a] = discount * expected_harvest(after, state, data, -1, 0.0, discount)
+        elif a == SAMPLE:
+            rock = np.int64(data.rock_at[cell])
+            good = 1.0 / (1.0 + np.exp(-state[FIRST + rock]))
+            values[a] = 10.0 * (2.0 * good - 1.0) + discount * expected_harvest(
+                cell, state, data, rock, COLLECTED, discount
+            )
+        else:
+            rock = a - CHECK
+            odds = state[FIRST + rock]
+            good = 1.0 / (1.0 + np.exp(-odds))
+            right = data.accuracy[cell * data.rocks + rock]
+            evidence = data.evidence[cell * data.rocks + rock]
+            seen_good = good * right + (1.0 - good) * (1.0 - right)
+            values[a] = discount * (
+                seen_good * expected_harvest(cell, state, data, rock, odds + evidence, discount)
+                + (1.0 - seen_good) * expected_harvest(cell, state, data, rock, odds - evidence, discount)
+            )
