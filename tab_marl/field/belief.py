@@ -139,14 +139,14 @@ class ProductBelief:
         chain, options = self.chain, self.options
         away = ((chain.centres - np.asarray(point, dtype=np.float64)) ** 2).sum(axis=1)
         nearest = float(away.min())  # relative to the nearest cell: a point inside a wall is the wall's edge
-        modes = self._mode_likelihood(heading, speed_fraction)
+        modes = mode_likelihood(chain, options, heading, speed_fraction)
         for cells in (options.position_cells, options.wide_cells):
-            likelihood = _position_kernel(away - nearest, cells * chain.cell_metres)
+            likelihood = position_kernel(away - nearest, cells * chain.cell_metres)
             if self._reweigh(likelihood, modes):
                 if cells != options.position_cells:
                     self._fell_back()
                 return cells == options.position_cells
-        self._restart(_position_kernel(away - nearest, options.position_cells * chain.cell_metres), modes)
+        self._restart(position_kernel(away - nearest, options.position_cells * chain.cell_metres), modes)
         self._fell_back()
         return False
 
@@ -176,21 +176,6 @@ class ProductBelief:
     def _fell_back(self) -> None:
         self.fallbacks += 1
         self.log_evidence = -np.inf
-
-    def _mode_likelihood(self, heading: float | None, speed_fraction: float | None) -> NDArray[np.float64]:
-        chain, options = self.chain, self.options
-        likelihood = np.ones(chain.modes)
-        moving = np.isfinite(chain.headings)
-        if not moving.any():
-            return likelihood
-        if heading is not None:
-            peaked = np.exp(options.heading_concentration * (np.cos(heading - chain.headings[moving]) - 1))
-            likelihood[moving] = np.maximum(peaked, options.heading_floor)
-            likelihood[~moving] = likelihood[moving].mean()  # at rest any heading is equally likely
-        if speed_fraction is not None and not moving.all():
-            still = speed_fraction < options.still_fraction
-            likelihood[moving if still else ~moving] *= options.heading_floor
-        return likelihood
 
     def _reweigh(self, cell_weight: NDArray[np.float64], mode_weight: NDArray[np.float64]) -> bool:
         """Multiply by a likelihood and normalise; leave the belief as it was and return False if hardly any is left."""
@@ -248,7 +233,25 @@ class ProductBelief:
         return float(self.masses[self.chain.complete[self.automaton_states]].sum())
 
 
-def _position_kernel(squared_metres: NDArray[np.float64], deviation: float) -> NDArray[np.float64]:
+def mode_likelihood(
+    chain: ProductChain, options: BeliefOptions, heading: float | None, speed_fraction: float | None
+) -> NDArray[np.float64]:
+    """``[M]``: of a seen heading and speed in each mode."""
+    likelihood = np.ones(chain.modes)
+    moving = np.isfinite(chain.headings)
+    if not moving.any():
+        return likelihood
+    if heading is not None:
+        peaked = np.exp(options.heading_concentration * (np.cos(heading - chain.headings[moving]) - 1))
+        likelihood[moving] = np.maximum(peaked, options.heading_floor)
+        likelihood[~moving] = likelihood[moving].mean()  # at rest any heading is equally likely
+    if speed_fraction is not None and not moving.all():
+        still = speed_fraction < options.still_fraction
+        likelihood[moving if still else ~moving] *= options.heading_floor
+    return likelihood
+
+
+def position_kernel(squared_metres: NDArray[np.float64], deviation: float) -> NDArray[np.float64]:
     """Gaussian, cut off at 4 deviations."""
     return np.where(squared_metres <= 16 * deviation**2, np.exp(-0.5 * squared_metres / deviation**2), 0.0)
 

@@ -151,7 +151,7 @@ class Completes:
             )
         scenario = problem.scenario
         mission = parse_mission(self.mission, scenario) if isinstance(self.mission, str) else self.mission
-        name = f"completes '{to_english(mission, scenario)}'"
+        name = f'completes "{to_english(mission, scenario)}"'
         if any(c.speed_limit is not None for c in mission.constraints):
             raise ValueError(f"{name}: a speed limit cannot be read off the cells; leave it out of the second mission")
         compiled = compile_mission(mission, scenario, scenario.step_seconds)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -10,16 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tab_marl.field import kernels
-from tab_marl.field.belief import EXACT, ProductBelief
+from tab_marl.field.belief import EXACT, BeliefOptions, ProductBelief
 from tab_marl.field.chain import ProductChain, Table
+from tab_marl.field.constraints import Tilt
+from tab_marl.field.events import Completes, Event
+from tab_marl.field.evidence import Observation
+from tab_marl.field.paths import MostLikelyPath, most_likely_path, path_entropy
+from tab_marl.field.posterior import Posterior, posterior
 from tab_marl.field.sampling import Trajectories, sample_paths
+from tab_marl.field.sweep import Sweep, moments, sweep
+from tab_marl.field.tracking import HAPPENED, track
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from matplotlib.figure import Figure
 
-    from tab_marl.field.constraints import Tilt
     from tab_marl.field.problem import FieldProblem
     from tab_marl.field.report import FitReport
 
@@ -107,26 +113,121 @@ class TabField:
         return {name: float(v / t) if t > 0 else 0.0 for name, v, t in zip(names, visits, total, strict=True)}
 
     @cached_property
+    def _sweep(self) -> Sweep:
+        return sweep(self.problem, self.bridge, self._exactness)
+
+    @property
+    def _exactness(self) -> BeliefOptions:
+        """Small masses are dropped where single precision blurs them anyway."""
+        return EXACT if self.problem.options.precision == "double" else BeliefOptions()
+
+    @property
     def occupancy_by_status(self) -> Floats:
-        """``[T + 1, 2, C]``: probability of each cell at each tick with the mission under way (0) or complete (1)."""
-        belief = ProductBelief(self.bridge, EXACT if self.problem.options.precision == "double" else None)
-        table = np.zeros((self.problem.horizon + 1, 2, self.bridge.cells))
-        for t in range(self.problem.horizon + 1):
-            if t:
-                belief.predict()
-            for q, mass in zip(belief.automaton_states, belief.masses, strict=True):
-                table[t, int(q == self.bridge.accepting)] += mass.reshape(self.bridge.cells, -1).sum(axis=1)
-        return table
+        """``[T + 1, 2, C]``: probability of each cell at each tick with the mission not complete (0) or complete (1)."""
+        return self._sweep.by_status
 
     @cached_property
     def occupancy(self) -> Floats:
         """``[T + 1, C]``: probability of each cell at each tick; after completion the reference process goes on."""
         return self.occupancy_by_status.sum(axis=1)
 
+    @property
+    def automaton_occupancy(self) -> Floats:
+        """``[T + 1, Q]``: probability of each automaton state at each tick."""
+        return self._sweep.automaton
+
+    def occupancy_by_state(self, tick: int) -> tuple[NDArray[np.int32], Floats]:
+        """(``[n]`` automaton states with mass at this tick, ``[n, C]`` probability of each with each cell)."""
+        if not 0 <= tick <= self.problem.horizon:
+            raise ValueError(f"tick is {tick}, must lie in 0..{self.problem.horizon}, the field's horizon")
+        for moment in moments(self.bridge, tick, self._exactness):
+            pass
+        by_cell = moment.masses.reshape(len(moment.masses), self.bridge.cells, -1).sum(axis=2)
+        return moment.automaton_states, by_cell
+
     @cached_property
     def completion_probability(self) -> Floats:
         """``[T + 1]``: probability that the mission is complete by each tick."""
         return self.occupancy_by_status[:, 1].sum(axis=1)
+
+    @property
+    def stage_times(self) -> dict[str, Floats]:
+        """Stage -> ``[T + 1]`` probability that it is completed at exactly that tick. A stage is one counted visit."""
+        return dict(zip(self.problem.stage_names, self._sweep.stage_done, strict=True))
+
+    @cached_property
+    def path_entropy(self) -> float:
+        """Entropy in nats of the trajectory (start, cells, modes) up to the tick at which the mission ends."""
+        visits, _ = expected_visits(self.bridge, self.problem.automaton.rank)
+        return path_entropy(self, visits)
+
+    def most_likely_path(self, completing: bool = True) -> MostLikelyPath:
+        """The trajectory of largest probability, up to the mission's end; by default among those that complete it."""
+        return most_likely_path(self, completing)
+
+    def track(self, *events: Event) -> TabField:
+        """The same law, on an automaton that also watches these events (see `event_probabilities`)."""
+        tracked = track(self.problem, events)
+        tracking = tracked.tracking
+        assert tracking is not None
+        weight = self.tilt.log_weight()[tracking.parent_state][:, tracking.parent_symbol]
+        return self._lifted(tracked, weight)
+
+    def _lifted(self, problem: FieldProblem, log_weight: Floats) -> TabField:
+        from tab_marl.field.solve import message
+
+        tilt = Tilt.given(problem, log_weight, self.tilt.log_failure)
+        return TabField(problem, message(problem, tilt), tilt, None, self.marginal_error, self.rounds, self.report)
+
+    @property
+    def event_probabilities(self) -> tuple[float, ...]:
+        """Of the events that the field's automaton watches: those of soft constraints, then those of `track`."""
+        tracking = self.problem.tracking
+        if tracking is None:
+            return ()
+        return tuple(float(self.transitions[happens].sum()) for happens in tracking.happens)
+
+    def probability(self, event: Event) -> float:
+        """Of an event: ``field.probability(Passes("Checkpoint B"))``."""
+        if isinstance(event, Completes) and event.mission is None:
+            return self.completes
+        return self.track(event).event_probabilities[-1]
+
+    def given_latest_event(self) -> TabField:
+        """The law given that the event tracked last happens. Raises InfeasibleField if it cannot."""
+        tracking, automaton = self.problem.tracking, self.problem.automaton
+        if tracking is None:
+            raise ValueError("no event is tracked: use field.track(event).given_latest_event()")
+        ending = np.isin(automaton.delta, [automaton.accepting, automaton.rejecting])
+        ending[[automaton.accepting, automaton.rejecting]] = False
+        happened = (tracking.decided[-1] == HAPPENED)[:, None] | tracking.happens[-1]
+        given = self._lifted(self.problem, np.where(ending & ~happened, -np.inf, self.tilt.log_weight()))
+        # P(s0) is bound no longer: starts from which the event is likelier gain.
+        gain = start_log_partition(given.bridge) - start_log_partition(self.bridge)
+        used = given.bridge.start > 0
+        start = np.zeros(self.bridge.cells)
+        start[used] = self.bridge.start[used] * np.exp(gain[used])
+        return replace(given, bridge=given.bridge._replace(start=start / start.sum()))
+
+    def condition(self, *observations: Observation, options: BeliefOptions | None = None) -> Posterior:
+        """What the field says given sightings and non-sightings at any ticks (filter and smoother).
+
+        Raises ImpossibleEvidence where an observation has probability 0; warns NearZeroEvidence where it nearly has.
+        """
+        return posterior(self, observations, self._exactness if options is None else options)
+
+    def save(self, path: str | Path) -> None:
+        """Write it to one ``.npz`` file: arrays and JSON, no code. `TabField.load` reads it back."""
+        from tab_marl.field.storage import save_field
+
+        save_field(self, path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> TabField:
+        """Read what `save` wrote; nothing in the file is executed. Raises FieldFormatError, OSError."""
+        from tab_marl.field.storage import load_field
+
+        return load_field(path)
 
     def belief(self) -> ProductBelief:
         """A fresh filter at tick 0."""
@@ -141,10 +242,19 @@ class TabField:
         return sample_paths(self.chain, self.belief(), rng, count, self.problem.horizon if ticks is None else ticks)
 
     def plot(self, path: str | Path | None = None, panels: int = 8) -> Figure:
-        """Small multiples of the occupancy over time on the map; written to `path` if given. Needs matplotlib."""
+        """Small multiples of the occupancy over time, the likeliest and sampled paths, and when the stages are completed.
+
+        Written to `path` if given. Needs matplotlib; more pictures: `tab_marl.field.drawing`.
+        """
         from tab_marl.field.drawing import draw_field
 
         return draw_field(self, path, panels)
+
+    def animate(self, path: str | Path, frames_per_second: int = 8) -> int:
+        """The occupancy over time as a .gif, or .mp4 where ffmpeg is installed; returns the number of frames."""
+        from tab_marl.field.animation import animate_field
+
+        return animate_field(self, path, frames_per_second)
 
 
 def start_log_partition(chain: ProductChain) -> Floats:
@@ -166,6 +276,11 @@ def expected_transitions(chain: ProductChain, rank: NDArray[np.int32]) -> Floats
 
     `rank` ``[Q]`` rises along transitions between transient states, so each of them is visited at most once.
     """
+    return expected_visits(chain, rank)[1]
+
+
+def expected_visits(chain: ProductChain, rank: NDArray[np.int32]) -> tuple[Table, Floats]:
+    """(``[Q, S]`` probability of ever visiting each transient state, ``[Q, L]`` of ever taking each transition)."""
     count, symbols = chain.delta.shape
     belief = ProductBelief(chain, EXACT)
     mass = np.zeros(chain.value.shape, dtype=chain.value.dtype)
@@ -178,4 +293,4 @@ def expected_transitions(chain: ProductChain, rank: NDArray[np.int32]) -> Floats
     slot[absorbing] = -1
     order = np.argsort(rank, kind="stable").astype(np.int32)
     kernels.forward(order[~np.isin(order, [*absorbing, chain.initial])], chain, slot, mass, flux)
-    return flux
+    return mass, flux
