@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from tab_marl.envs.adversary_kernels import HEIGHT, OBSTACLES, PROPOSITIONS, REGION_AT, WIDTH
-from tab_marl.world.kernels import unicycle_step
+from tab_marl.world.kernels import unicycle_step, wrap_angle
 
 
 @njit(cache=True)
@@ -27,15 +27,24 @@ def drive(bank, k, x, y, theta, v, w, radius, seconds, substeps):
     if free_metres(bank, k, x, y, reach) > reach:
         x, y, theta = unicycle_step(x, y, theta, v, w, seconds * substeps)
         return x, y, theta, v, False
-    speed, touched = v, False
+    # A substep's chord, turned by w * seconds from one substep to the next.
+    turn = w * seconds
+    chord = v * seconds
+    if abs(turn) > 1e-9:
+        chord *= math.sin(0.5 * turn) / (0.5 * turn)
+    along_x, along_y = chord * math.cos(theta + 0.5 * turn), chord * math.sin(theta + 0.5 * turn)
+    cos, sin = math.cos(turn), math.sin(turn)
+    touched = pushed = False
+    from_x, from_y = x, y
     for _ in range(substeps):
         from_x, from_y = x, y
-        x, y, theta = unicycle_step(x, y, theta, v, w, seconds)
-        x, y, pushed = push_out(bank, k, x, y, radius)
+        x, y, pushed = push_out(bank, k, x + along_x, y + along_y, radius)
         touched = touched or pushed
-        speed = v
-        if pushed:
-            speed = ((x - from_x) * math.cos(theta) + (y - from_y) * math.sin(theta)) / seconds
+        along_x, along_y = along_x * cos - along_y * sin, along_x * sin + along_y * cos
+    theta = wrap_angle(theta + turn * substeps)
+    speed = v
+    if pushed:
+        speed = ((x - from_x) * math.cos(theta) + (y - from_y) * math.sin(theta)) / seconds
     return x, y, theta, speed, touched
 
 
@@ -61,18 +70,22 @@ def push_out(bank, k, x, y, radius):
     number, real = bank.number[k], bank.real[k]
     touched = False
     for _ in range(2):
+        at_x, at_y = x, y
         for i in range(number[OBSTACLES]):
             region = number[REGION_AT] + number[PROPOSITIONS] + i
+            dx, dy = bank.region_centre[region, 0] - x, bank.region_centre[region, 1] - y
+            near = radius + bank.region_reach[region]
+            if dx * dx + dy * dy >= near * near:
+                continue
             nx, ny, gap = outward(bank.disc, bank.region_first, bank.halfplanes, bank.corners, region, x, y)
             if gap < radius:
                 x += (radius - gap) * nx
                 y += (radius - gap) * ny
-                touched = True
-        inner_x = min(max(x, radius), real[WIDTH] - radius)
-        inner_y = min(max(y, radius), real[HEIGHT] - radius)
-        if inner_x != x or inner_y != y:
-            touched = True
-            x, y = inner_x, inner_y
+        x = min(max(x, radius), real[WIDTH] - radius)
+        y = min(max(y, radius), real[HEIGHT] - radius)
+        if x == at_x and y == at_y:
+            break
+        touched = True
     return x, y, touched
 
 

@@ -6,6 +6,11 @@ GYMNASIUM_IDS = {
     "tab_marl/Ego-v0": "tab_marl.envs.single_agent:ego_env",
     "tab_marl/Adversary-v0": "tab_marl.envs.single_agent:adversary_env",
 }
+BATCHED_IDS = {
+    "tab_marl/BatchedEgo-v0": "tab_marl.envs.batched_env:batched_ego_env",
+    "tab_marl/BatchedAdversary-v0": "tab_marl.envs.batched_env:batched_adversary_env",
+}
+"""For `gymnasium.make_vec` only."""
 PETTINGZOO_ID = "tab_marl/intercept-v0"
 PETTINGZOO_ENTRY_POINTS = {
     "parallel": "tab_marl.envs.intercept_v0:parallel_env",
@@ -21,6 +26,9 @@ def register_all() -> None:
     for name, entry_point in GYMNASIUM_IDS.items():
         if name not in gymnasium.registry:
             gymnasium.register(id=name, entry_point=entry_point)
+    for name, entry_point in BATCHED_IDS.items():
+        if name not in gymnasium.registry:
+            gymnasium.register(id=name, vector_entry_point=entry_point)
     registries = {"parallel": pettingzoo.parallel_registry, "aec": pettingzoo.aec_registry}
     for kind, entry_point in PETTINGZOO_ENTRY_POINTS.items():
         if PETTINGZOO_ID not in registries[kind]:
