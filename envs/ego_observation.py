@@ -16,6 +16,10 @@ v, w
 goal x, y                   centre of the region that the ego must reach [m]; ego task avoidance only
 lidar 0 ..                  free distance [m], anticlockwise, the first ray along the heading
 ==========================  ==========================================================================================
+
+With several adversaries (`team.TeamEnv`) the seven rows of the adversary come once for each, in order, and are followed by
+one row "adversary k in play" each: 1 until it is intercepted or its mission ended it. With several egos the six rows of
+every other ego follow, in order: egos always know of each other. The lidar stays last.
 """
 
 from __future__ import annotations
@@ -47,16 +51,20 @@ class Row(NamedTuple):
     high: float
 
 
-def ego_rows(scenario: Scenario) -> tuple[Row, ...]:
-    """The layout of the ego's observation, in order."""
+def ego_rows(scenario: Scenario, egos: int = 1, adversaries: int = 1) -> tuple[Row, ...]:
+    """The layout of an ego's observation, in order; with so many egos and adversaries in the arena."""
     w, h = scenario.width_metres, scenario.height_metres
     horizon = max(scenario.horizon_seconds, TIME_BOUND_SECONDS)
+    names = [("seen", "adversary ")]
+    if adversaries > 1:
+        names = [(f"seen {j}", f"adversary {j} ") for j in range(adversaries)]
     return (
         *robot_rows("", scenario.ego, w, h),
         Row("elapsed", 0.0, horizon),
         Row("left", 0.0, horizon),
-        Row("seen", 0.0, 1.0),
-        *robot_rows("adversary ", scenario.adversary, w, h),
+        *(row for name in names for row in (Row(name[0], 0.0, 1.0), *robot_rows(name[1], scenario.adversary, w, h))),
+        *(Row(f"adversary {j} in play", 0.0, 1.0) for j in range(adversaries) if adversaries > 1),
+        *(row for k in range(egos - 1) for row in robot_rows(f"other ego {k} ", scenario.ego, w, h)),
         *goal_rows(scenario),
         *(Row(f"lidar {i}", 0.0, scenario.sensors.lidar_metres) for i in range(scenario.sensors.lidar_rays)),
     )
@@ -82,9 +90,9 @@ def robot_rows(prefix: str, robot: Robot, width: float, height: float) -> tuple[
     )
 
 
-def ego_space(scenario: Scenario) -> Box:
+def ego_space(scenario: Scenario, egos: int = 1, adversaries: int = 1) -> Box:
     """The Box of `ego_rows`, float32."""
-    return box_of(ego_rows(scenario))
+    return box_of(ego_rows(scenario, egos, adversaries))
 
 
 def box_of(rows: Sequence[Row]) -> Box:

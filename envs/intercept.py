@@ -148,7 +148,7 @@ class InterceptEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
         )
         task = options.get("task") or source(rng)
         scenario: Scenario = task.scenario
-        self._check_shape(scenario)
+        check_shape(scenario, self._shape_of, ego_rows(scenario), self.observation_spaces[EGO_AGENT])
         given = {name: check_start(scenario, options[name], name) for name in ("ego_start", "adversary_start") if name in options}  # fmt: skip
         starts = draw_starts(scenario, rng, given.get("ego_start"), given.get("adversary_start"))
         control_seconds = 1.0 / scenario.control_hertz
@@ -269,25 +269,28 @@ class InterceptEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
             ADVERSARY_AGENT: {**common, "collided": events.adversary_collided},
         }
 
-    def _check_shape(self, scenario: Scenario) -> None:
-        """A task drawn or given at reset must fit the spaces, which cannot change."""
-        if scenario.ego_task != self._shape_of.ego_task:
+
+def check_shape(scenario: Scenario, shape_of: Scenario, rows: tuple[Row, ...], space: Box) -> None:
+    """A task drawn or given at reset must fit the spaces, which cannot change. Raises ValueError.
+
+    `rows`: the layout of an ego's observation on this scenario; `shape_of`: the scenario that the spaces were made for.
+    """
+    if scenario.ego_task != shape_of.ego_task:
+        raise ValueError(
+            f"the task's scenario {scenario.name!r} is for {scenario.ego_task}, the environment was made for "
+            f"{shape_of.ego_task}: make an environment for it"
+        )
+    if len(rows) != space.shape[0]:
+        raise ValueError(
+            f"the task's scenario {scenario.name!r} has {scenario.sensors.lidar_rays} lidar rays, the environment was "
+            f"made for {shape_of.sensors.lidar_rays}: make an environment for it"
+        )
+    for row, high in zip(rows, space.high.tolist(), strict=True):
+        if row.high > high * (1 + 1e-6):
             raise ValueError(
-                f"the task's scenario {scenario.name!r} is for {scenario.ego_task}, the environment was made for "
-                f"{self._shape_of.ego_task}: make an environment for it"
+                f"the task's scenario {scenario.name!r} needs {row.name} up to {row.high:g}, the environment was made "
+                f"for {high:g}: make an environment for it"
             )
-        space, rows = self.observation_spaces[EGO_AGENT], ego_rows(scenario)
-        if len(rows) != space.shape[0]:
-            raise ValueError(
-                f"the task's scenario {scenario.name!r} has {scenario.sensors.lidar_rays} lidar rays, the environment was "
-                f"made for {self._shape_of.sensors.lidar_rays}: make an environment for it"
-            )
-        for row, high in zip(rows, space.high.tolist(), strict=True):
-            if row.high > high * (1 + 1e-6):
-                raise ValueError(
-                    f"the task's scenario {scenario.name!r} needs {row.name} up to {row.high:g}, the environment was made "
-                    f"for {high:g}: make an environment for it"
-                )
 
 
 def _ego_task_info(episode: Episode) -> dict[str, Any]:

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from tab_marl.envs.episode import Episode
 from tab_marl.envs.mission_scene import MissionScene
 from tab_marl.envs.physics import ADVERSARY, EGO
-from tab_marl.envs.rendering import Frame, Renderer, Window, lidar_ranges
+from tab_marl.envs.rendering import Frame, Other, Renderer, Window, lidar_ranges
+from tab_marl.envs.team_episode import TeamEpisode
 from tab_marl.world.scenario import Scenario
 
 
@@ -50,6 +51,43 @@ class LiveView:
             ranges=lidar_ranges(episode.scenario, ego) if self._show_lidar else None,
             heat=heat,
             heat_label=heat_label,
+            watched=episode.watched,
+            ego_ending="Goal reached" if episode.arrived else "Encounter" if episode.encountered else "",
+        )
+
+    def team_frame(self, episode: TeamEpisode, heat: NDArray[np.float64] | None, heat_label: str, over: bool) -> Frame:
+        """The present moment of a team's episode: the panel follows the first ego and the first adversary."""
+        n = episode.egos
+        monitor = episode.monitors[0]
+        done, visits = monitor.progress[0], 0
+        if monitor.location >= 0:
+            visits = int(monitor.automaton.visits[monitor.location])
+        others = [
+            Other(motion, np.array(trail), i < n, i < n or bool(episode.seen[i - n]))
+            for i, (motion, trail) in enumerate(zip(episode.motions, episode.paths, strict=True))
+            if i not in (0, n) and (i < n or episode.in_play[i - n])
+        ]
+        return Frame(
+            ego=episode.motions[0],
+            adversary=episode.motions[n],
+            seconds=episode.seconds,
+            ego_trail=np.array(episode.paths[0]),
+            adversary_trail=np.array(episode.paths[n]),
+            seen_by=episode.seen[0],
+            last_seen=episode.sighted[0],
+            status=monitor.status,
+            why_failed=monitor.why_failed,
+            stage=done,
+            visits=visits,
+            mission_seconds_left=monitor.seconds_left,
+            intercepted=all(captor is not None for captor in episode.captor),
+            completed_seconds=episode.completed_at[0],
+            over=over,
+            ranges=lidar_ranges(episode.scenario, episode.motions[0]) if self._show_lidar else None,
+            heat=heat,
+            heat_label=heat_label,
+            others=tuple(others),
+            adversary_in_play=episode.in_play[0],
         )
 
     def array(self, frame: Frame) -> NDArray[np.uint8]:

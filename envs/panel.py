@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 INSET = 24
 STATUS_COLOURS = {"active": d.INK, "completed": d.ADVERSARY, "failed": d.MUTED}
+RADII = {"interception": "interception radius", "avoidance": "encounter radius", "surveillance": "watching radius"}
 MISSION_LINES = 7
 """Longer mission texts are cut."""
 
@@ -119,6 +120,9 @@ def _sensors(picture: pygame.Surface, x: int, y: int, width: int, scenario: Scen
         names = ", ".join(scenario.checkpoints[i].name for i in frame.seen_by)
         text, colour = f"adversary at {names}", d.INK
         pygame.draw.rect(picture, d.LIT, (x, y + 2, 4, 14), border_radius=2)
+    elif frame.watched:
+        text, colour = "adversary in plain sight", d.INK
+        pygame.draw.rect(picture, d.LIT, (x, y + 2, 4, 14), border_radius=2)
     elif frame.last_seen is not None:
         text, colour = f"nothing for {frame.seconds - frame.last_seen[2]:.1f} s", d.MUTED
         pygame.draw.rect(picture, d.LINE, (x, y + 2, 4, 14), border_radius=2)
@@ -145,12 +149,14 @@ def _legend(
     entries: list[tuple[str, d.Colour, str]] = [
         ("ego", d.EGO, "disc"),
         ("adversary (pale: unseen)", d.ADVERSARY, "disc"),
-        ("interception radius", d.EGO, "ring"),
+        (RADII[scenario.ego_task], d.EGO, "ring"),
         ("camera, idle / seeing", d.LIT, "camera"),
         ("current goal", d.GOAL, "region"),
     ]
     if scene is not None and scene.avoided:
         entries.append(("to be avoided", d.FORBIDDEN, "region"))
+    if scenario.ego_goal is not None:
+        entries.append(("the ego's goal", d.EGO, "region"))
     if frame.last_seen is not None:
         entries.append(("last sighting", d.ADVERSARY, "cross"))
     if frame.heat is not None:

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tab_marl.envs.episode import Episode
 from tab_marl.envs.heat import HeatSource, heat_source
 from tab_marl.envs.mission_scene import mission_scene
+from tab_marl.envs.team_episode import TeamEpisode
 from tab_marl.mission import to_english
 from tab_marl.mission.tasks import Task
 from tab_marl.world.scenario import Scenario
@@ -48,7 +50,7 @@ class Pictures:
         self._heat = heat_source(field, scenario)
         self._heat_label = label
 
-    def draw(self, episode: Any, over: bool) -> NDArray[np.uint8] | None:
+    def draw(self, episode: Episode | TeamEpisode, over: bool) -> NDArray[np.uint8] | None:
         """The picture ``[height, width, 3]`` in mode "rgb_array"; None in mode "human", which shows it in a window."""
         if self.mode is None or self._task is None:
             raise RuntimeError(f"render() needs a render_mode: make the environment with one of {list(RENDER_MODES)}")
@@ -58,7 +60,10 @@ class Pictures:
             self._view = LiveView(self._title, self._show_lidar)
             self._start_view(self._view, self._task)
         heat = None if self._heat is None else self._heat()
-        frame = self._view.frame(episode, heat, self._heat_label, over)
+        if isinstance(episode, TeamEpisode):
+            frame = self._view.team_frame(episode, heat, self._heat_label, over)
+        else:
+            frame = self._view.frame(episode, heat, self._heat_label, over)
         if self.mode == "rgb_array":
             return self._view.array(frame)
         self._view.show(frame, FRAMES_PER_SECOND)

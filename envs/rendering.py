@@ -33,6 +33,18 @@ TRAIL_SECONDS = 12.0
 
 
 @dataclass(frozen=True, eq=False)
+class Other:
+    """A robot beside the first of each side, in a team."""
+
+    motion: Motion
+    trail: NDArray[np.float64]
+    """``[N, 2]`` metres, one point per control step, the newest last."""
+    is_ego: bool
+    seen: bool
+    """By a camera; egos always are."""
+
+
+@dataclass(frozen=True, eq=False)
 class Frame:
     """One moment of an episode, for drawing."""
 
@@ -64,6 +76,14 @@ class Frame:
     heat: NDArray[np.float64] | None = None
     """``[rows, columns]`` a belief or field over the map, row 0 at the bottom."""
     heat_label: str = "belief"
+    others: tuple[Other, ...] = ()
+    """Robots in play beside `ego` and `adversary`."""
+    adversary_in_play: bool = True
+    """False once it left the arena, in a team; then it is not drawn."""
+    watched: bool = False
+    """Ego task surveillance: the ego watches the adversary."""
+    ego_ending: str = ""
+    """Ego task avoidance: how it ended, "Goal reached" or "Encounter"."""
 
 
 class Renderer:
@@ -91,22 +111,27 @@ class Renderer:
         self._write_names(frame)
         self._draw_trail(frame.adversary_trail, d.ADVERSARY)
         self._draw_trail(frame.ego_trail, d.EGO)
+        for other in frame.others:
+            self._draw_trail(other.trail, d.EGO if other.is_ego else d.ADVERSARY)
         if frame.ranges is not None:
             self._draw_lidar(frame.ego, frame.ranges)
-        if frame.last_seen is not None and not frame.seen_by:
+        if frame.last_seen is not None and not (frame.seen_by or frame.watched):
             self._draw_last_seen(frame.last_seen)
         self._draw_robots(frame)
         picture = pygame.Surface(self.size)
         picture.fill(d.PAPER)
         scaled = canvas.picture()
         picture.blit(scaled, (0, self._map_top))
-        if frame.intercepted:
+        if frame.ego_ending:
+            colour = d.EGO if frame.ego_ending == "Goal reached" else d.ADVERSARY
+            self._write_banner(picture, f"{frame.ego_ending} at {frame.seconds:.1f} s", colour)
+        elif frame.intercepted:
             late = frame.completed_seconds is not None
             text = f"Intercepted at {frame.seconds:.1f} s" + (", after the mission" if late else "")
             self._write_banner(picture, text, d.ADVERSARY if late else d.EGO)
         elif frame.over and frame.completed_seconds is not None:
             self._write_banner(picture, f"Mission completed at {frame.completed_seconds:.1f} s", d.ADVERSARY)
-        elif frame.over:
+        elif frame.over and self.scenario.ego_task == "interception":
             self._write_banner(picture, f"Not intercepted in {frame.seconds:.1f} s", d.ADVERSARY)
         draw_panel(picture, self.size[0] - PANEL_PIXELS, PANEL_PIXELS, self.scenario, self.scene, frame)
         return picture
@@ -162,6 +187,8 @@ class Renderer:
                 canvas.region(place, d.MUTED, 26, 1.5, 160)
         for goal in goals:
             canvas.region(goal, d.GOAL, 46, 2.5)
+        if scenario.ego_goal is not None:
+            canvas.region(scenario.ego_goal, d.EGO, 46, 2.5)
         canvas.surface.set_clip(None)
 
     def _goals(self, frame: Frame) -> tuple[Region, ...]:
@@ -203,11 +230,19 @@ class Renderer:
 
     def _draw_robots(self, frame: Frame) -> None:
         canvas, scenario = self._canvas, self.scenario
-        ego = frame.ego
-        canvas.disc(ego.x, ego.y, scenario.interception_metres, d.EGO, 18)
-        canvas.dashes(ego.x, ego.y, scenario.interception_metres, d.EGO, 1.5, 170)
-        _draw_robot(canvas, frame.adversary, scenario.adversary.radius_metres, d.ADVERSARY, bool(frame.seen_by))
-        _draw_robot(canvas, ego, scenario.ego.radius_metres, d.EGO, True)
+        egos = [frame.ego, *(other.motion for other in frame.others if other.is_ego)]
+        reach = scenario.watch_metres if scenario.ego_task == "surveillance" else scenario.interception_metres
+        for ego in egos:
+            canvas.disc(ego.x, ego.y, reach, d.LIT if frame.watched else d.EGO, 40 if frame.watched else 18)
+            canvas.dashes(ego.x, ego.y, reach, d.EGO, 1.5, 170)
+        if frame.adversary_in_play:
+            seen = bool(frame.seen_by) or frame.watched
+            _draw_robot(canvas, frame.adversary, scenario.adversary.radius_metres, d.ADVERSARY, seen)
+        for other in frame.others:
+            if not other.is_ego:
+                _draw_robot(canvas, other.motion, scenario.adversary.radius_metres, d.ADVERSARY, other.seen)
+        for ego in egos:
+            _draw_robot(canvas, ego, scenario.ego.radius_metres, d.EGO, True)
 
     def _write_names(self, frame: Frame) -> None:
         canvas, goals = self._canvas, self._goals(frame)
