@@ -239,7 +239,9 @@ def alternatives(problem: FieldProblem) -> list[NDArray[np.int64]]:
         side_by_side = np.unique(offered[automaton.location == location])
         side_by_side = side_by_side[side_by_side >= 0]
         for b in side_by_side[1:]:
-            parent[root(int(b))] = root(int(side_by_side[0]))
+            for other in side_by_side[side_by_side < b]:
+                if not automaton.sides or automaton.sides[b] == automaton.sides[other]:
+                    parent[root(int(b))] = root(int(other))
     roots = np.array([root(b) for b in range(len(parent))], dtype=np.int64)
     groups = [np.flatnonzero(roots == r) for r in np.unique(roots)]
     return [group for group in groups if len(group) > 1]

@@ -2,103 +2,37 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
-from tab_marl.field import processes
 from tab_marl.field.chain import check_nonnegative
+from tab_marl.field.options import FieldOptions
 from tab_marl.field.reference import Reference, from_matrices
-from tab_marl.field.stages import stages_of
+from tab_marl.mission.finite import FiniteAutomaton
 from tab_marl.world.grid import GridMap
-from tab_marl.world.scenario import Scenario, UnknownName
+from tab_marl.world.scenario import Scenario
 from tab_marl.world.volume import Volume
 from tab_marl.world.voxels import VoxelMap
 
 if TYPE_CHECKING:
     from tab_marl.field.events import SoftConstraint, TimingPrior
+    from tab_marl.field.from_mission import Process
+    from tab_marl.field.sizing import FieldSize
     from tab_marl.field.tracking import Tracking
-    from tab_marl.mission.automaton import MissionAutomaton
     from tab_marl.mission.model import Mission
     from tab_marl.mission.unroll import TickAutomaton
 
+__all__ = ["COMPLETE", "FAILED", "UNDER_WAY", "FieldOptions", "FieldProblem", "Transitions"]
+
 Transitions = Reference | sparse.sparray | sparse.spmatrix | NDArray[np.float64] | Sequence[object]
 
-CELL_SIZES_METRES = (0.05, 0.1)
-"""Tried in this order when `FieldOptions.cell_metres` is None."""
 UNDER_WAY, COMPLETE, FAILED = 0, 1, 2
 """How a mission stands: values of `FieldProblem.status`."""
-ROUGH_CELL_METRES = 0.15
-ROUGH_FROM = 1_500_000
-"""Automaton states x base states from which a first fit on rough cells saves time."""
-
-
-@dataclass(frozen=True)
-class FieldOptions:
-    """How motion is modelled and which constraints beyond the mission hold."""
-
-    reference: Literal["run_and_tumble", "walk", "paper_walk"] = "run_and_tumble"
-    """`walk`: memoryless, displacements up to full speed. `paper_walk`: memoryless, all cells within one tick's reach."""
-    cell_metres: float | None = None
-    """None: the finest of CELL_SIZES_METRES within `state_budget`."""
-    headings: int = 16
-    """Directions of run-and-tumble; halved when even the coarsest cells exceed the budget."""
-    mean_run_metres: float = 1.0
-    goal_marginals: bool = True
-    """Where several places can serve, each is visited equally often."""
-    timing_prior: bool = False
-    """The completion tick is uniform over the feasible ticks."""
-    completion_probability: float = 1.0
-    """c of the paper's eq. 1: how likely the adversary completes its mission; below 1 it may fail."""
-    kernel: Literal["bridge", "marginal"] = "bridge"
-    """`bridge`: the field's own transition law. `marginal`: each next state is drawn from the field's marginal at that
-    tick, whatever the present state (the letter of the paper); such trajectories jump."""
-    precision: Literal["single", "double"] = "single"
-    """Of the stored messages; the work is always done in double precision."""
-    state_budget: int = 8_000_000
-    """Automaton states x cells x modes up to which finer cells are preferred."""
-    marginal_tolerance: float = 0.05
-    """Relative error at which goal marginals, timing priors and completion probability are met."""
-    constraint_tolerance: float = 1e-4
-    """Error of a probability at which a soft constraint is met."""
-    max_iterations: int = 60
-    """Of the fit of their weights."""
-    least_share: float = 1e-9
-    """A place or tick that the reference reaches less often than this share is not feasible and gets no equal share."""
-
-    def __post_init__(self) -> None:
-        for name, known in (
-            ("reference", ("run_and_tumble", "walk", "paper_walk")),
-            ("kernel", ("bridge", "marginal")),
-            ("precision", ("single", "double")),
-        ):
-            if getattr(self, name) not in known:
-                raise UnknownName(f"FieldOptions.{name}", str(getattr(self, name)), known)
-        for name in ("cell_metres", "mean_run_metres", "marginal_tolerance", "constraint_tolerance", "state_budget"):
-            value = getattr(self, name)
-            if value is not None and not (math.isfinite(value) and value > 0):
-                raise ValueError(f"FieldOptions.{name} is {value}, must be > 0")
-        if not 0 < self.completion_probability <= 1:
-            raise ValueError(
-                f"FieldOptions.completion_probability is {self.completion_probability}, must lie in (0, 1]"
-            )
-        if self.headings < 4:
-            raise ValueError(f"FieldOptions.headings is {self.headings}, must be >= 4")
-        if self.max_iterations < 1:
-            raise ValueError(f"FieldOptions.max_iterations is {self.max_iterations}, must be >= 1")
-
-    @classmethod
-    def preset(cls, name: str) -> FieldOptions:
-        """`default`, or `paper`: the literal field (memoryless, the mission alone) with displacements repaired."""
-        presets = {"default": cls(), "paper": cls(reference="walk", goal_marginals=False)}
-        if name not in presets:
-            raise UnknownName("field preset", name, presets)
-        return presets[name]
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,11 +47,13 @@ class FieldProblem:
     labels: ArrayLike
     """``[C]`` symbol of each cell, 0..L-1: a column of the automaton's table."""
     automaton: TickAutomaton
+    """Acyclic but for its two absorbing states: `unroll` makes one of a mission, `from_arrays` of any automaton."""
     start: ArrayLike
     """``[C]`` distribution of the first cell."""
     horizon: int
     """Ticks shown by `TabField.occupancy` and sampled by default."""
-    options: FieldOptions = field(default_factory=lambda: FieldOptions(precision="double", marginal_tolerance=1e-10, constraint_tolerance=1e-10)
+    options: FieldOptions = field(
+        default_factory=lambda: FieldOptions(precision="double", marginal_tolerance=1e-10, constraint_tolerance=1e-10)
     )
     reference_of: ArrayLike | None = None
     """``[Q]`` which of several references holds in each automaton state."""
@@ -148,7 +84,10 @@ class FieldProblem:
         cells = motion.states // motion.modes
         if labels.shape != (cells,):
             raise ValueError(f"FieldProblem.labels has shape {labels.shape}, must be [{cells}], one symbol per cell")
-        states, symbols = self.automaton.delta.shape
+        if self.horizon < 0:
+            raise ValueError(f"FieldProblem.horizon is {self.horizon}, must be >= 0 ticks")
+        automaton = self.automaton
+        states, symbols = automaton.delta.shape
         if labels.min() < 0 or labels.max() >= symbols:
             raise ValueError(
                 f"FieldProblem.labels lie in {labels.min()}..{labels.max()}, must lie in 0..{symbols - 1}: "
@@ -158,27 +97,26 @@ class FieldProblem:
         check_nonnegative("FieldProblem.start", start, (cells,))
         if abs(start.sum() - 1) > 1e-9:
             raise ValueError(f"FieldProblem.start sums to {start.sum():.12g}, must sum to 1")
-        if self.horizon < 0:
-            raise ValueError(f"FieldProblem.horizon is {self.horizon}, must be >= 0 ticks")
         which = np.zeros(states, dtype=np.int32) if self.reference_of is None else np.asarray(self.reference_of)
         if which.shape != (states,) or which.min() < 0 or which.max() >= motion.count:
             raise ValueError(f"FieldProblem.reference_of must be [{states}] with entries in 0..{motion.count - 1}")
         transient = np.ones(states, dtype=bool)
-        transient[[self.automaton.accepting, self.automaton.rejecting]] = False
-        following = self.automaton.delta
-        rank = self.automaton.rank
+        transient[[automaton.accepting, automaton.rejecting]] = False
+        following = automaton.delta
+        rank = automaton.rank
         backwards = transient[:, None] & transient[following] & (rank[following] <= rank[:, None])
         if backwards.any():
             q, symbol = np.argwhere(backwards)[0]
             raise ValueError(
                 f"FieldProblem.automaton is not acyclic: state {q} (rank {rank[q]}) leads to {following[q, symbol]} "
-                f"(rank {rank[following[q, symbol]]}); unroll its clocks first"
+                f"(rank {rank[following[q, symbol]]}): unbounded, it would need up to {states} x {self.horizon + 1} ticks = "
+                f"{states * (self.horizon + 1):,} states; give it as a FiniteAutomaton to FieldProblem.from_arrays"
             )
         object.__setattr__(self, "labels", labels)
         object.__setattr__(self, "start", start)
         object.__setattr__(self, "reference_of", which.astype(np.int32))
         standing = np.full(states, UNDER_WAY, dtype=np.int8)
-        standing[self.automaton.accepting], standing[self.automaton.rejecting] = COMPLETE, FAILED
+        standing[automaton.accepting], standing[automaton.rejecting] = COMPLETE, FAILED
         status = standing if self.status is None else np.asarray(self.status, dtype=np.int8)
         stage = (status == COMPLETE).astype(np.int32) if self.stage is None else np.asarray(self.stage, dtype=np.int32)
         for name, array in (("status", status), ("stage", stage)):
@@ -222,122 +160,81 @@ class FieldProblem:
         return with_constraints(self, constraints)
 
     @classmethod
+    def from_arrays(
+        cls,
+        transitions: Transitions,
+        labels: ArrayLike,
+        automaton: FiniteAutomaton | TickAutomaton,
+        start: ArrayLike,
+        horizon: int,
+        options: FieldOptions | None = None,
+        *,
+        reference_of: ArrayLike | None = None,
+        branch_places: Sequence[str] = (),
+        grid: GridMap | VoxelMap | None = None,
+    ) -> FieldProblem:
+        """A field of any Markov chain and any deterministic finite automaton, which may have cycles.
+
+        Args:
+            transitions: ``[S, S]`` rows >= 0 with sum <= 1, dense or SciPy sparse, one or several; or a `Reference`.
+            labels: ``[C]`` what the automaton reads in each cell, at every tick from 0.
+            automaton: cycles are unrolled over the horizon; states that no word of these labels reaches, and those
+                from which it cannot be completed in time, are pruned.
+            start: ``[C]`` distribution of the first cell.
+            horizon: the last tick at which the automaton may accept.
+            options: default: nothing beyond the automaton, double precision.
+            reference_of: ``[Q]`` which of several references holds in each state of the automaton as given.
+            branch_places: names of the automaton's branches.
+            grid: where the cells lie.
+        Raises:
+            ValueError: shapes do not fit, something is not a distribution, or the automaton is too large to unroll.
+        """
+        which = reference_of
+        if isinstance(automaton, FiniteAutomaton):
+            finite = automaton
+            cells = np.asarray(labels, dtype=np.int32)
+            automaton = finite.unrolled(horizon, cells, cells[np.asarray(start) > 0] if len(cells) else None)
+            which = None if which is None else finite.of_states(which, automaton.location, "reference_of")
+        settings = {} if options is None else {"options": options}
+        return cls(
+            transitions, labels, automaton, start, horizon,
+            reference_of=which, grid=grid, branch_places=tuple(branch_places), **settings,
+        )  # fmt: skip
+
+    @classmethod
     def from_mission(
         cls,
-        mission: Mission | str,
+        mission: Mission | str | Sequence[Mission | str],
         scenario: Scenario | Volume,
         options: FieldOptions | None = None,
         horizon_ticks: int | None = None,
         constraints: Sequence[SoftConstraint | TimingPrior] = (),
+        process: Process | None = None,
     ) -> FieldProblem:
         """The field of a mission (or its English text) in a scenario, under soft constraints beside it.
 
         The start is uniform over the free cells in `scenario.adversary_start` (the nearest free cell if there is none).
+
+        Args:
+            mission: several are all to be completed (their conjunction).
+            process: builds the reference on the map, in place of `options.reference`.
         """
-        from tab_marl.mission.compile import compile_mission
-        from tab_marl.mission.unroll import unroll
+        from tab_marl.field.from_mission import problem_of
 
-        if isinstance(mission, str):
-            from tab_marl.mission.parse import parse_mission
-
-            mission = parse_mission(mission, scenario)
-        options = options or FieldOptions()
-        horizon = scenario.horizon_ticks if horizon_ticks is None else horizon_ticks
-        compiled = compile_mission(mission, scenario, scenario.step_seconds)
-        tumbling = options.reference == "run_and_tumble"
-        sizes = CELL_SIZES_METRES if options.cell_metres is None else (options.cell_metres,)
-        for size in sizes:
-            grid = map_of(scenario, size)
-            automaton = unroll(compiled, horizon, compiled.masks(grid.centres))
-            entries = len(automaton.delta) * grid.cells
-            if entries * (options.headings + 1 if tumbling else 1) <= options.state_budget:
-                break
-        while options.cell_metres is None and tumbling and options.headings >= 16:
-            if entries * (options.headings + 1) <= options.state_budget:
-                break
-            options = replace(options, headings=options.headings // 2)
-        problem = cls._on_grid(compiled, grid, automaton, scenario, options, horizon)
-        worth_it = entries * (options.headings + 1) > ROUGH_FROM and grid.cell_metres < ROUGH_CELL_METRES
-        if worth_it and tumbling and options.goal_marginals and len(compiled.branch_places) > 1:
-            rough = map_of(scenario, ROUGH_CELL_METRES)
-            automaton = unroll(compiled, horizon, compiled.masks(rough.centres))
-            coarse = replace(options, headings=8)
-            problem = replace(problem, rough=cls._on_grid(compiled, rough, automaton, scenario, coarse, horizon))
-        problem = replace(problem, mission=mission)
+        problem = problem_of(mission, scenario, options or FieldOptions(), horizon_ticks, process)
         return problem.constrained(*constraints) if constraints else problem
 
-    @classmethod
-    def _on_grid(
-        cls,
-        compiled: MissionAutomaton,
-        grid: GridMap | VoxelMap,
-        automaton: TickAutomaton,
-        scenario: Scenario | Volume,
-        options: FieldOptions,
-        horizon: int,
-    ) -> FieldProblem:
-        motion, which = _motion(grid, scenario, options, automaton.speed_limit)
-        return cls(
-            motion,
-            automaton.symbols(compiled.masks(grid.centres)),
-            automaton,
-            start_cells(grid, scenario),
-            horizon,
-            options,
-            which,
-            grid,
-            scenario,
-            tuple(compiled.branch_places),
-            earliest_tick(compiled, grid, scenario) if options.timing_prior else 0,
-            None,
-            *stages_of(compiled, automaton),
-        )
+    def size(self) -> FieldSize:
+        """What solving takes, known before it starts: states, bytes, and seconds at a rate measured on this problem."""
+        from tab_marl.field.sizing import size_of
 
+        return size_of(self)
 
-def _motion(
-    grid: GridMap | VoxelMap, scenario: Scenario | Volume, options: FieldOptions, speed_limit: NDArray[np.float64]
-) -> tuple[Reference, NDArray[np.int32]]:
-    """One reference per speed limit in force somewhere, the fastest first, and which one holds in each state."""
-    top = scenario.adversary.max_speed
-    capped = np.minimum(speed_limit, top)
-    speeds = np.append(top, np.unique(capped[capped < top])[::-1])
-    which = np.searchsorted(-speeds, -capped).astype(np.int32)
-    steps = speeds * scenario.step_seconds
-    if options.reference == "run_and_tumble":
-        return processes.run_and_tumble(grid, steps, options.headings, options.mean_run_metres), which
-    build = processes.walk if options.reference == "walk" else processes.paper_walk
-    return build(grid, steps), which
+    def pruned(self) -> FieldProblem:
+        """The same problem without automaton states that no feasible motion from the start visits on a way to completion.
 
+        Exact for the field. A filter that sees the adversary do what the reference cannot has no state left for it.
+        """
+        from tab_marl.field.pruning import pruned
 
-def map_of(world: Scenario | Volume, cell_metres: float) -> GridMap | VoxelMap:
-    """The world cut into cells."""
-    if isinstance(world, Volume):
-        return VoxelMap.from_volume(world, cell_metres)
-    return GridMap.from_scenario(world, cell_metres)
-
-
-def start_cells(grid: GridMap | VoxelMap, scenario: Scenario | Volume) -> NDArray[np.float64]:
-    """``[C]``: uniform over the free cells whose centres lie in the adversary's start region."""
-    region = scenario.adversary_start
-    inside = np.asarray(region.contains(grid.centres))
-    if not inside.any():
-        inside[grid.cells_of([region.centre])] = True
-    return np.asarray(inside / inside.sum())
-
-
-def earliest_tick(
-    compiled: MissionAutomaton, grid: GridMap | VoxelMap, scenario: Scenario | Volume
-) -> NDArray[np.int64]:
-    """``[C]``: the first tick at which the shortest path at full speed from each start cell completes the mission."""
-    from tab_marl.mission.route import solve_route
-
-    inside = np.flatnonzero(start_cells(grid, scenario))
-    route = solve_route(compiled, grid)
-    earliest = np.zeros(grid.cells, dtype=np.int64)
-    for cell, mask in zip(inside, compiled.masks(grid.centres[inside]), strict=True):
-        location = compiled.first(int(mask)).location
-        metres = float(route.length[location, cell]) if location >= 0 else 0.0
-        if math.isfinite(metres):
-            ticks = metres / (scenario.adversary.max_speed * scenario.step_seconds)
-            earliest[cell] = math.ceil(ticks - 1e-9)
-    return earliest
+        return pruned(self)

@@ -15,6 +15,7 @@ from tab_marl.field.fitting import History, fit
 from tab_marl.field.infeasible import InfeasibleField
 from tab_marl.field.problem import COMPLETE, UNDER_WAY, FieldProblem
 from tab_marl.field.sampling import Trajectories, sample_paths
+from tab_marl.field.sizing import refuse_beyond_memory
 from tab_marl.field.tab_field import TabField, expected_transitions, start_log_partition
 
 Floats = NDArray[np.float64]
@@ -31,7 +32,8 @@ SAMPLED_PATHS = 2000
 def solve(problem: FieldProblem) -> TabField:
     """The maximum-entropy distribution over trajectories that complete the mission (paper, eq. 1).
 
-    Exact on the product of cells and mission automaton (design, section 4). Raises InfeasibleField.
+    Exact on the product of cells and mission automaton (design, section 4). Raises InfeasibleField, and FieldTooLarge beyond
+    `FieldOptions.memory_gigabytes`.
     """
     try:
         return _solve(problem)
@@ -43,6 +45,7 @@ def solve(problem: FieldProblem) -> TabField:
 
 
 def _solve(problem: FieldProblem) -> TabField:
+    refuse_beyond_memory(problem)
     if problem.constraints:
         from tab_marl.field.dual import fit_soft
 

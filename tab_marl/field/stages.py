@@ -30,7 +30,7 @@ def stages_of(compiled: MissionAutomaton, automaton: TickAutomaton) -> tuple[NDA
 
 def earliest_of_stage(mission: Mission, scenario: Scenario, grid: GridMap, stage: int) -> NDArray[np.int64]:
     """Of the mission cut off after the last goal that this stage completes."""
-    from tab_marl.field.problem import earliest_tick
+    from tab_marl.field.from_mission import earliest_tick
     from tab_marl.mission.compile import compile_mission
 
     compiled = compile_mission(mission, scenario, scenario.step_seconds)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,8 +11,17 @@ from numpy.typing import ArrayLike, NDArray
 from tab_marl.mission import kernels
 from tab_marl.mission.automaton import ALWAYS_FORBIDDEN, COMPLETED, MISSION_CLOCK, UNBOUNDED, MissionAutomaton
 
+if TYPE_CHECKING:
+    from tab_marl.mission.joint import JointAutomaton
+
+MOST_STATES = 4_000_000
+"""An automaton that unrolls to more states is refused: its tables alone would take gigabytes."""
 UNTRACKED = -1
 """`mission_ticks` of a state whose mission clock does not matter from there on."""
+
+
+class AutomatonTooLarge(ValueError):
+    """Unrolled in ticks the automaton would have no bound, or too many states; says how many."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +50,9 @@ class TickAutomaton:
     """``[Q]`` m/s, inf if none."""
     clocks: NDArray[np.int32]
     """``[Q, 3]`` the clocks as kept: no further than they matter from this state on."""
+    sides: tuple[int, ...] = ()
+    """``[B]`` which of several missions a branch belongs to (places of different ones cannot stand for one another);
+    empty: all to one."""
 
     @property
     def states(self) -> int:
@@ -56,24 +69,42 @@ class TickAutomaton:
         return found.astype(np.int32)
 
 
-def unroll(automaton: MissionAutomaton, horizon_ticks: int, masks: ArrayLike | None = None) -> TickAutomaton:
+def unroll(
+    automaton: MissionAutomaton | JointAutomaton, horizon_ticks: int | None, masks: ArrayLike | None = None
+) -> TickAutomaton:
     """Unroll the clocks that matter. The mission fails at the first tick beyond the horizon.
 
-    `masks`: the labels that occur (any shape, repeats allowed; default all 2**P); fewer labels give fewer states.
+    Args:
+        automaton: of one mission, or of several that are all to be completed.
+        horizon_ticks: None where the mission bounds itself.
+        masks: the labels that occur (any shape, repeats allowed; default all 2**P). Only states that some word of
+            these labels reaches are made.
+    Raises:
+        AutomatonTooLarge: no bound, or more than `MOST_STATES` states; with the size it would need.
     """
-    if horizon_ticks < 0:
+    if horizon_ticks is not None and horizon_ticks < 0:
         raise ValueError(f"horizon_ticks is {horizon_ticks}, must be >= 0")
+    if not isinstance(automaton, MissionAutomaton):
+        return automaton.unrolled(horizon_ticks, masks)
     labels = automaton.next_location.shape[1]
     symbols = np.unique(np.arange(labels) if masks is None else np.asarray(masks)).astype(np.int32)
     if len(symbols) == 0 or symbols[0] < 0 or symbols[-1] >= labels:
         raise ValueError(f"masks must be a non-empty set of labels in 0..{labels - 1}, got {symbols.tolist()}")
     latest = automaton.latest
     # Every location ends by itself, within the horizon on every path? Then the horizon needs no clock of its own.
-    if bool((latest < UNBOUNDED).any(axis=1).all()):
+    bounded_itself = (latest < UNBOUNDED).any(axis=1)
+    if bounded_itself.all():
         found = _unrolled(automaton, latest, symbols)
         # A state of depth d is reached at tick d - 1 at the latest, and left for good one tick later.
-        if int(found.rank[: found.accepting].max()) <= horizon_ticks:
+        if horizon_ticks is None or int(found.rank[: found.accepting].max()) <= horizon_ticks:
             return found
+    if horizon_ticks is None:
+        waiting = int(np.flatnonzero(~bounded_itself)[0])
+        sizes = [unroll(automaton, ticks, symbols).states for ticks in (100, 200)]
+        raise AutomatonTooLarge(
+            f"the mission has no bound (location {waiting} may wait for ever), so unrolled it has no end: {sizes[0]:,} "
+            f"states for a horizon of 100 ticks, {sizes[1]:,} for 200; give horizon_ticks, or the mission a deadline"
+        )
     bounded = latest.copy()
     bounded[:, MISSION_CLOCK] = np.minimum(bounded[:, MISSION_CLOCK], horizon_ticks)
     return _unrolled(automaton, bounded, symbols)
@@ -94,6 +125,21 @@ def _caps(automaton: MissionAutomaton, latest: NDArray[np.int32], symbols: NDArr
     return caps
 
 
+def states_at_most(caps: NDArray[np.int32]) -> int:
+    """How many (location, clocks) there can be, clocks kept up to ``caps[U, 3]``.
+
+    The visit clock never runs ahead of the stage clock, nor that of the mission clock: each is reset with those after it.
+    """
+    total = 0
+    for mission, stage, visit in caps.tolist():
+        s = np.arange(stage + 1)
+        # Mission clocks that a stage clock allows, the kept stage clock being exact below its cap.
+        per_stage = np.maximum(1, mission - np.minimum(s, mission) + 1)
+        from_stage = np.cumsum(per_stage[::-1])[::-1]
+        total += int(from_stage[np.minimum(np.arange(visit + 1), stage)].sum())
+    return total + 1
+
+
 def _unrolled(automaton: MissionAutomaton, latest: NDArray[np.int32], symbols: NDArray[np.int32]) -> TickAutomaton:
     caps = _caps(automaton, latest, symbols)
     tables = (
@@ -105,7 +151,14 @@ def _unrolled(automaton: MissionAutomaton, latest: NDArray[np.int32], symbols: N
         count, location, clocks, delta = kernels.unroll(*tables, automaton.initial, caps, symbols, capacity)
         if count >= 0:
             break
-        capacity *= 4
+        if capacity == MOST_STATES:
+            raise AutomatonTooLarge(
+                f"unrolled in ticks of {automaton.tick_seconds:g} s the mission's automaton has more than "
+                f"{MOST_STATES:,} states, and up to {states_at_most(caps):,}: its clocks run to "
+                f"{', '.join(f'{c:,}' for c in caps.max(axis=0))} ticks (mission, stage, visit); use shorter bounds, "
+                "a shorter horizon or longer ticks"
+            )
+        capacity = min(4 * capacity, MOST_STATES)
     # Locations are numbered forwards, and within one location some kept clock grows with every tick.
     order = np.lexsort((clocks.sum(axis=1), location)).astype(np.int32)
     rank = kernels.longest_depth(delta, order)

@@ -2,5 +2,6 @@
 
 from tab_marl.field.processes.isotropic import paper_walk, walk
 from tab_marl.field.processes.tumble import run_and_tumble
+from tab_marl.field.processes.unicycle import unicycle
 
-__all__ = ["paper_walk", "run_and_tumble", "walk"]
+__all__ = ["paper_walk", "run_and_tumble", "unicycle", "walk"]

@@ -1,0 +1,82 @@
+"""How a field models motion, and which constraints beyond the mission hold."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from tab_marl.world.scenario import UnknownName
+
+
+@dataclass(frozen=True)
+class FieldOptions:
+    """How motion is modelled and which constraints beyond the mission hold."""
+
+    reference: Literal["run_and_tumble", "walk", "paper_walk", "unicycle"] = "run_and_tumble"
+    """`walk`: memoryless, displacements up to full speed. `paper_walk`: memoryless, all cells within one tick's reach.
+    `unicycle`: any speed and turn rate that the robot has, afresh each tick."""
+    cell_metres: float | None = None
+    """None: the finest of CELL_SIZES_METRES within `state_budget`."""
+    headings: int = 16
+    """Directions of run-and-tumble and unicycle (in space 6, 14 or 26, and no unicycle); halved when even the coarsest cells exceed the budget."""
+    mean_run_metres: float = 1.0
+    goal_marginals: bool = True
+    """Where several places can serve, each is visited equally often."""
+    timing_prior: bool = False
+    """The completion tick is uniform over the feasible ticks."""
+    completion_probability: float = 1.0
+    """c of the paper's eq. 1: how likely the adversary completes its mission; below 1 it may fail."""
+    kernel: Literal["bridge", "marginal"] = "bridge"
+    """`bridge`: the field's own transition law. `marginal`: each next state is drawn from the field's marginal at that
+    tick, whatever the present state (the letter of the paper); such trajectories jump."""
+    precision: Literal["single", "double"] = "single"
+    """Of the stored messages; the work is always done in double precision."""
+    state_budget: int = 8_000_000
+    """Automaton states x cells x modes up to which finer cells are preferred."""
+    memory_gigabytes: float = 4.0
+    """`solve` refuses a problem that needs more (1 GB = 1e9 bytes)."""
+    marginal_tolerance: float = 0.05
+    """Relative error at which goal marginals, timing priors and completion probability are met."""
+    constraint_tolerance: float = 1e-4
+    """Error of a probability at which a soft constraint is met."""
+    max_iterations: int = 60
+    """Of the fit of their weights."""
+    least_share: float = 1e-9
+    """A place or tick that the reference reaches less often than this share is not feasible and gets no equal share."""
+
+    def __post_init__(self) -> None:
+        for name, known in (
+            ("reference", ("run_and_tumble", "walk", "paper_walk", "unicycle")),
+            ("kernel", ("bridge", "marginal")),
+            ("precision", ("single", "double")),
+        ):
+            if getattr(self, name) not in known:
+                raise UnknownName(f"FieldOptions.{name}", str(getattr(self, name)), known)
+        for name in (
+            "cell_metres",
+            "mean_run_metres",
+            "marginal_tolerance",
+            "constraint_tolerance",
+            "state_budget",
+            "memory_gigabytes",
+        ):
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise ValueError(f"FieldOptions.{name} is {value}, must be > 0")
+        if not 0 < self.completion_probability <= 1:
+            raise ValueError(
+                f"FieldOptions.completion_probability is {self.completion_probability}, must lie in (0, 1]"
+            )
+        if self.headings < 4:
+            raise ValueError(f"FieldOptions.headings is {self.headings}, must be >= 4")
+        if self.max_iterations < 1:
+            raise ValueError(f"FieldOptions.max_iterations is {self.max_iterations}, must be >= 1")
+
+    @classmethod
+    def preset(cls, name: str) -> FieldOptions:
+        """`default`, or `paper`: the literal field (memoryless, the mission alone) with displacements repaired."""
+        presets = {"default": cls(), "paper": cls(reference="walk", goal_marginals=False)}
+        if name not in presets:
+            raise UnknownName("field preset", name, presets)
+        return presets[name]
