@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, TypeAlias
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tab_marl.planning.explanation import Explanation, explain
 from tab_marl.planning.model import action_names
 from tab_marl.planning.tree import ROOT, SearchTree
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Stopped: TypeAlias = Literal["simulations", "seconds", "closed", "full"]
 """Why a search ended: its budget of simulations or of seconds; its bounds met (DESPOT); its memory (DESPOT)."""
@@ -47,29 +52,24 @@ class Plan:
         return [(self.names[action], observation) for action, observation in self.tree.best_line()]
 
     def table(self) -> str:
-        """Actions with value, standard of trial and share of simulations, best first, as text."""
-        width = max(6, *(len(name) for name in self.names))
-        total = max(1, int(self.visits.sum()))
-        rows = [f"  {'action':<{width}}  {'value':>10}  {'visits':>8}  share"]
-        for a in sorted(range(len(self.names)), key=lambda a: (-self.values[a], a)):
-            if self.visits[a] > 0:
-                mark = "*" if a == self.action else " "
-                rows.append(
-                    f"{mark} {self.names[a]:<{width}}  {self.values[a]:>10.3f}  {self.visits[a]:>8d}  "
-                    f"{self.visits[a] / total:>5.1%}"
-                )
-        return "\n".join(rows)
+        """Actions with value, visits and share of simulations, best first, as text."""
+        return self.explain().table()
 
-    def explain(self) -> str:
-        """The table, the best line and the size of the search, as text."""
-        line = " > ".join(name if seen is None else f"{name} (sees {seen})" for name, seen in self.best_line())
-        return (
-            f"{self.table()}\nbest line: {line}\n"
-            f"{self.simulations} simulations in {self.seconds * 1000:.1f} ms, {len(self.tree)} nodes, {self.depth} steps deep"
-        )
+    def explain(self, belief: Any = None, name_of: Callable[[Any], str] = str) -> Explanation:
+        """Why: values, visits, lead, most likely line, size of the search, and how uncertain `belief` is; print the result.
+
+        `belief` is what the plan was made from (states, `Particles`, a filter or a sampler), `name_of` writes observations.
+        """
+        return explain(self, belief, name_of)
+
+    def draw(self, path: str | Path | None = None, **options: Any) -> Figure:
+        """The tree as a picture (.svg, .png, .pdf); options of `tab_marl.planning.drawing.draw_plan`."""
+        from tab_marl.planning.drawing import draw_plan
+
+        return draw_plan(self, path, **options)
 
     def __str__(self) -> str:
-        return self.explain()
+        return str(self.explain())
 
 
 class Planner(Protocol):
