@@ -7,10 +7,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
 
 from tab_marl.planning.filter_report import Deprivation, EventLog, FilterReport, ImpossibleObservation, named
-from tab_marl.planning.model import CompiledModel, Particles, TableData, action_names
+from tab_marl.planning.model import CompiledModel, Particles, action_names
+from tab_marl.planning.tables import SparseData, SparseRows, TableData
 
 _LISTED = 5
 """Observations that a message lists as possible."""
@@ -38,17 +40,15 @@ class ExactFilter:
 
     def __post_init__(self) -> None:
         data = self.model.data
-        if not isinstance(data, TableData):
+        if not isinstance(data, TableData | SparseData):
             raise TypeError(
                 f"an exact filter needs tables, and this model's data is a {type(data).__name__}: see table_model"
             )
         if not 0 <= self.doubt <= 1:
             raise ValueError(f"doubt is {self.doubt}, must be in [0, 1]")
         size = len(data.terminal)
-        shape = (self.model.actions, size, -1)
-        # What the tables hold is cumulative.
-        self._transition = np.diff(data.transition.reshape(shape), axis=2, prepend=0.0)
-        self._observation = np.diff(data.observation.reshape(shape), axis=2, prepend=0.0)
+        self._transition = _by_action(data.transition, self.model.actions, size)
+        self._observation = _by_action(data.observation, self.model.actions, 1 + int(_last_column(data.observation)))
         self._goes_on = ~data.terminal
         self._prior = self._distribution("prior", np.ones(size) if self.prior is None else self.prior)
         self._names = action_names(self.model)
@@ -65,9 +65,10 @@ class ExactFilter:
         """Takes the step in which `action` was done, `observation` seen, and the process did not end. Returns itself."""
         if not 0 <= action < self.model.actions:
             raise ValueError(f"action is {action}, must be in 0..{self.model.actions - 1}")
-        if not 0 <= observation < self._observation.shape[2]:
-            raise ValueError(f"observation is {observation}, must be in 0..{self._observation.shape[2] - 1}")
-        joint = self._moved(self.probabilities, action) * self._observation[action][:, observation]
+        seen = self._observation[action].shape[1]
+        if not 0 <= observation < seen:
+            raise ValueError(f"observation is {observation}, must be in 0..{seen - 1}")
+        joint = self._moved(self.probabilities, action) * self._chance(action, observation)
         if self.strict and not joint.sum() > 0:
             raise ImpossibleObservation(self._event(action, observation, None, self._log.updates + 1))
         self._log.updates += 1
@@ -103,6 +104,11 @@ class ExactFilter:
         moved: NDArray[np.float64] = (belief @ self._transition[action]) * self._goes_on
         return moved
 
+    def _chance(self, action: int, observation: int) -> NDArray[np.float64]:
+        """``[S]``: the probability of the observation in each state reached."""
+        column = self._observation[action][:, [observation]]
+        return np.asarray(column.toarray() if scipy.sparse.issparse(column) else column).ravel()
+
     def _recover(self, action: int, observation: int) -> None:
         replayed = self._replayed()
         event = self._event(action, observation, "replay" if replayed is not None else "fallback", self._log.updates)
@@ -118,7 +124,7 @@ class ExactFilter:
         explained = False
         for action, observation in self._history:
             moved = self._moved(belief, action)
-            chance = self._observation[action][:, observation]
+            chance = self._chance(action, observation)
             best = chance[moved > 0].max(initial=0.0)
             explained = bool(best > 0)
             belief = moved * np.maximum(chance, self.doubt * best) if explained else moved
@@ -131,7 +137,7 @@ class ExactFilter:
         if self.fallback is not None:
             return self._distribution("fallback", self.fallback(action, observation))
         moved = self._moved(self._prior, action)
-        joint = moved * self._observation[action][:, observation]
+        joint = moved * self._chance(action, observation)
         for belief in (joint, moved):
             if belief.sum() > 0:
                 return belief / belief.sum()
@@ -152,3 +158,19 @@ class ExactFilter:
         if p.shape != (size,) or not np.isfinite(p).all() or (p < 0).any() or not p.sum() > 0:
             raise ValueError(f"{name} must be {size} numbers, finite, >= 0 and not all zero; its shape is {p.shape}")
         return p / p.sum()
+
+
+def _last_column(rows: NDArray[np.float64] | SparseRows) -> int:
+    return int(rows.number.max()) if isinstance(rows, SparseRows) else rows.shape[1] - 1
+
+
+def _by_action(rows: NDArray[np.float64] | SparseRows, actions: int, columns: int) -> list[Any]:
+    """Per action the probabilities ``[S, columns]``, dense or sparse as the tables are, from the cumulative ones."""
+    if not isinstance(rows, SparseRows):
+        return list(np.diff(rows.reshape(actions, -1, columns), axis=2, prepend=0.0))
+    chances = np.diff(rows.cumulative, prepend=0.0)
+    starts = rows.first[:-1]
+    chances[starts] = rows.cumulative[starts]
+    table = scipy.sparse.csr_array((chances, rows.number, rows.first), shape=(len(rows.first) - 1, columns))
+    size = table.shape[0] // actions
+    return [table[a * size : (a + 1) * size] for a in range(actions)]

@@ -34,7 +34,7 @@ def mixed(word: int) -> int:
     return word ^ (word >> 31)
 
 
-class _Stream:
+class Stream:
     def __init__(self, word: int) -> None:
         self.word = word
 
@@ -62,7 +62,7 @@ class _CompiledAsPython:
         self.states, self.weights = belief_states(model, belief, count, rng)
         shared = len(self.states) if common else 0
         words = rng.integers(2**64, size=2 + shared, dtype=np.uint64)
-        self.stream, self.word, self.seeds = _Stream(int(words[0])), words[1:2], words[2:]
+        self.stream, self.word, self.seeds = Stream(int(words[0])), words[1:2], words[2:]
         self.has_rollout, self.has_prior = model.rollout is not None, model.prior is not None
 
     def start(self, particle: int) -> NDArray[np.float64]:
@@ -103,7 +103,7 @@ class _PythonModel:
                 "the belief is empty: give at least one state (an updater that lost all particles must refill)"
             )
         self.weights = check_weights(weights, len(self.states))
-        self.stream = _Stream(int(rng.integers(2**64, dtype=np.uint64)))
+        self.stream = Stream(int(rng.integers(2**64, dtype=np.uint64)))
         self.rng = np.random.default_rng(int(rng.integers(2**63)))
         shared = len(self.states) if common else 0
         self.seeds = rng.integers(2**63, size=shared)
@@ -143,7 +143,7 @@ class _Growing:
     def edges_of(self, node: int) -> range:
         return range(self.first_edge[node], self.first_edge[node] + self.edge_count[node])
 
-    def select(self, node: int, exploration: float, stream: _Stream) -> int:
+    def select(self, node: int, exploration: float, stream: Stream) -> int:
         untried = [e for e in self.edges_of(node) if self.edge_visits[e] == 0]
         if untried:
             return untried[stream.below(len(untried))]

@@ -13,11 +13,14 @@
     that many simulations are taken as done (Silver and Veness 2010, section 3.4 "preferred actions"); a count of -1 forbids the
     action there. Read from `state` only what the agent itself can see, or the hidden state leaks into the plan.
 
+``upper(state, depth, max_depth, discount, data) -> float`` (optional, for DESPOT)
+    A return that no policy can exceed from `state` on: often what could be earned if the state were known.
+
 `data` is whatever the functions need: a NamedTuple of arrays and numbers (or a tuple). The search is compiled once per *type*
 of data and cached on disk, so keep dtypes, dimensions and memory order the same from call to call, and let arrays be writable
 and C-contiguous. `rng` is uint64[1] for `tab_marl.planning.random_kernels`. Return ``np.int64`` observations, float rewards, bool terminals.
 
-**Tables** (`table_model`): transition, observation and reward arrays; a compiled model.
+**Tables** (`tab_marl.planning.tables.table_model`): transition, observation and reward arrays, dense or sparse; a compiled model.
 
 **Plain Python** (`PythonModel`): any class with ``step``; some hundred times slower, for small problems and for debugging.
 """
@@ -28,14 +31,13 @@ import warnings
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import numba
 import numpy as np
 from numba import typeof, types
 from numpy.typing import ArrayLike, NDArray
 
-from tab_marl.planning import table_kernels
 from tab_marl.planning.callbacks import callback
 
 _STATE = types.Array(types.float64, 1, "C")
@@ -59,6 +61,8 @@ class CompiledModel:
     prior: Callable[..., None] | None = None
     action_names: tuple[str, ...] = ()
     """For people; empty means the numbers."""
+    upper: Callable[..., float] | None = None
+    """For DESPOT."""
 
     def __post_init__(self) -> None:
         check_actions(self.actions, self.action_names)
@@ -85,12 +89,21 @@ class CompiledModel:
             )
         return step, rollout, prior
 
+    @cached_property
+    def upper_function(self) -> Any:
+        """`upper` compiled for this type of data, or None."""
+        if self.upper is None or getattr(numba.config, "DISABLE_JIT", 0):
+            return self.upper
+        signature = types.float64(_STATE, types.int64, types.int64, types.float64, typeof(self.data))
+        return callback(_plain(self.upper), signature)
+
 
 class PythonModel(Protocol):
     """A generative model in plain Python. Slow: every step is interpreted, some thousand simulations a second at best.
 
     May also have ``rollout(state, action, observation, depth, max_depth, discount, rng) -> float``,
-    ``prior(state, action, observation, depth) -> (values [A], counts [A])`` and ``action_names``, as in `CompiledModel`.
+    ``prior(state, action, observation, depth) -> (values [A], counts [A])``, ``upper(state, depth, max_depth, discount)`` and
+    ``action_names``, as in `CompiledModel`.
     """
 
     actions: int
@@ -147,81 +160,6 @@ class Particles:
 
 Sampler: TypeAlias = Callable[[int, np.random.Generator], ArrayLike]
 """``sampler(count, rng) -> [count, D]`` states drawn from the belief."""
-
-
-class TableData(NamedTuple):
-    """Tables as the kernel reads them; rows are ``action * S + state``."""
-
-    transition: NDArray[np.float64]
-    """``[A*S, S]`` cumulative."""
-    observation: NDArray[np.float64]
-    """``[A*S, O]`` cumulative, by the state reached."""
-    reward: NDArray[np.float64]
-    """``[A*S, S]`` by state left and state reached."""
-    terminal: NDArray[np.bool_]
-    """``[S]``."""
-
-
-def table_model(
-    transition: ArrayLike,
-    observation: ArrayLike,
-    reward: ArrayLike,
-    terminal: ArrayLike | None = None,
-    action_names: tuple[str, ...] = (),
-) -> CompiledModel:
-    """A POMDP with S states, A actions and O observations as a compiled model whose state is ``[state number]``.
-
-    `transition` ``[A, S, S]``: T(s' | s, a). `observation` ``[A, S, O]``: O(o | a, s'), s' the state reached. `reward`
-    ``[A, S]`` or ``[A, S, S]``: R(s, a) or R(s, a, s'). `terminal` ``[S]``: states that end the process when reached.
-    Raises ValueError when shapes disagree or a row is not a distribution.
-    """
-    t = _distributions("transition", transition, "T(. | state, action)")
-    actions, states = t.shape[:2]
-    if t.shape[2] != states:
-        raise ValueError(f"transition has shape {t.shape}, must be [A, S, S]")
-    o = _distributions("observation", observation, "O(. | action, state reached)")
-    if o.shape[:2] != (actions, states):
-        raise ValueError(f"observation has shape {o.shape}, must be [{actions}, {states}, O] to go with transition")
-    r = np.asarray(reward, dtype=np.float64)
-    if r.shape not in ((actions, states), (actions, states, states)):
-        raise ValueError(
-            f"reward has shape {r.shape}, must be [{actions}, {states}] or [{actions}, {states}, {states}]"
-        )
-    if not np.isfinite(r).all():
-        raise ValueError("reward has entries that are not finite")
-    if r.ndim == 2:
-        r = np.repeat(r[:, :, None], states, axis=2)
-    ends = np.zeros(states, dtype=np.bool_) if terminal is None else np.array(terminal, dtype=np.bool_)
-    if ends.shape != (states,):
-        raise ValueError(f"terminal has shape {ends.shape}, must be [{states}]")
-    data = TableData(
-        _cumulative(t).reshape(actions * states, states),
-        _cumulative(o).reshape(actions * states, o.shape[2]),
-        np.ascontiguousarray(r).reshape(actions * states, states),
-        ends,
-    )
-    return CompiledModel(table_kernels.step, actions, 1, data, action_names=action_names)
-
-
-def _distributions(name: str, table: ArrayLike, meaning: str) -> NDArray[np.float64]:
-    rows = np.asarray(table, dtype=np.float64)
-    if rows.ndim != 3:
-        raise ValueError(f"{name} has {rows.ndim} dimensions, must have 3")
-    bad = (rows < 0).any(axis=2) | ~np.isclose(rows.sum(axis=2), 1.0, rtol=0.0, atol=1e-9)
-    if bad.any():
-        action, state = (int(i) for i in np.argwhere(bad)[0])
-        raise ValueError(
-            f"{name}[{action}, {state}] = {meaning} is not a distribution: "
-            f"least entry {rows[action, state].min():g}, sum {rows[action, state].sum():g}, must be >= 0 and sum to 1"
-        )
-    return rows
-
-
-def _cumulative(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Cumulative sums whose last *possible* entry is exactly 1, so that no draw can land on an impossible one."""
-    total = np.cumsum(rows, axis=2)
-    total[total >= total[:, :, -1:]] = 1.0
-    return np.ascontiguousarray(total)
 
 
 def belief_states(

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from tab_marl.planning import filter_kernels
 from tab_marl.planning.callbacks import callback
-from tab_marl.planning.model import CompiledModel, Particles, TableData, belief_states, check_weights, draw_particles
+from tab_marl.planning.model import CompiledModel, Particles, belief_states, check_weights, draw_particles
+from tab_marl.planning.tables import SparseData, TableData
 
 _STATE = types.Array(types.float64, 1, "C")
 
@@ -40,6 +41,8 @@ def dynamics_of(model: Any, likelihood: Callable[..., float] | None) -> Particle
     if isinstance(model, CompiledModel):
         if given is None and isinstance(model.data, TableData):
             given = filter_kernels.table_likelihood
+        elif given is None and isinstance(model.data, SparseData):
+            given = filter_kernels.sparse_table_likelihood
         return CompiledDynamics(model, given)
     return PythonDynamics(model, given)
 

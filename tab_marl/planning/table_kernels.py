@@ -33,3 +33,33 @@ def step(state, action, data, rng):
     observation = np.int64(draw(data.observation, action * size + after, rng))
     state[0] = after
     return observation, data.reward[action * size + before, after], data.terminal[after]
+
+
+@njit(cache=True)
+def draw_sparse(rows, row, rng):
+    """A number drawn from row `row` of sparse cumulative probabilities: binary search among the entries."""
+    target = uniform(rng)
+    low = rows.first[row]
+    high = rows.first[row + 1] - 1
+    while low < high:
+        middle = (low + high) // 2
+        if rows.cumulative[middle] > target:
+            high = middle
+        else:
+            low = middle + 1
+    return low
+
+
+def sparse_step(state, action, data, rng):
+    """As `step`, from sparse tables."""
+    size = data.terminal.shape[0]
+    entry = draw_sparse(data.transition, action * size + np.int64(state[0]), rng)
+    after = data.transition.number[entry]
+    observation = data.observation.number[draw_sparse(data.observation, action * size + after, rng)]
+    state[0] = after
+    return np.int64(observation), data.reward[entry], data.terminal[after]
+
+
+def known_state_bound(state, depth, max_depth, discount, data):
+    """The best return if the state were always known."""
+    return data.best[np.int64(state[0])]

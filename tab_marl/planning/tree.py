@@ -51,6 +51,9 @@ class SearchTree:
     """``[edges]``."""
     observations: tuple[object, ...] | None = None
     """What observation number i was, where the model is plain Python (else observations are numbers already)."""
+    bounds: NDArray[np.float64] | None = None
+    """``[nodes, 2]`` lower and upper bound of the return from each node on, where the search keeps bounds (DESPOT). There an
+    edge's value is its lower bound, and visits count scenarios."""
 
     @classmethod
     def planted(cls, actions: NDArray[np.int64], values: NDArray[np.float64], visits: NDArray[np.int64]) -> SearchTree:

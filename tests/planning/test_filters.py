@@ -8,13 +8,15 @@ import warnings
 import numba
 import numpy as np
 import pytest
+import scipy.sparse
 
 from tab_marl.planning import table_kernels, textbook
 from tab_marl.planning.exact_filter import ExactFilter
 from tab_marl.planning.filter_report import BeliefWarning, ImpossibleObservation
-from tab_marl.planning.model import CompiledModel, Particles, table_model
+from tab_marl.planning.model import CompiledModel, Particles
 from tab_marl.planning.particle_filter import FilterOptions, ParticleFilter
 from tab_marl.planning.random_kernels import normal
+from tab_marl.planning.tables import table_model
 
 heavy = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="takes hours interpreted")
 
@@ -287,3 +289,22 @@ def test_bad_input_is_named():
         ParticleFilter(textbook.tiger(), [0.0, 1.0]).update(3, 0)
     with pytest.raises(ValueError, match="prior must be 2 numbers"):
         ExactFilter(textbook.tiger(), [1.0])
+
+
+@heavy
+def test_sparse_tables_are_filtered_as_dense_ones():
+    pomdp, prior = tables(4), np.array([0.5, 0.3, 0.2])
+    sparse = table_model(*([scipy.sparse.csr_array(m) for m in part] for part in pomdp[:2]), pomdp[2], pomdp[3])
+    dense_belief, sparse_belief = ExactFilter(table_model(*pomdp), prior), ExactFilter(sparse, prior)
+    particles = [
+        ParticleFilter(m, Particles(np.arange(3.0), prior), FilterOptions(300), 0)
+        for m in (table_model(*pomdp), sparse)
+    ]
+    for action, observation in HISTORY:
+        dense_belief.update(action, observation)
+        sparse_belief.update(action, observation)
+        assert sparse_belief.probabilities == pytest.approx(dense_belief.probabilities, abs=1e-12)
+        for belief in particles:
+            belief.update(action, observation)
+    assert np.array_equal(particles[0].states, particles[1].states)
+    assert particles[0].weights == pytest.approx(particles[1].weights, abs=1e-12)

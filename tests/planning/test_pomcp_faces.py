@@ -14,9 +14,10 @@ import pytest
 
 from tab_marl.planning import textbook
 from tab_marl.planning.belief import BeliefDepleted, update_particles
-from tab_marl.planning.model import CompiledModel, Particles, table_model
+from tab_marl.planning.model import CompiledModel, Particles
 from tab_marl.planning.pomcp import Pomcp, PomcpOptions
 from tab_marl.planning.random_kernels import uniform
+from tab_marl.planning.tables import table_model
 from tab_marl.planning.tree import ROOT
 
 heavy = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="takes hours interpreted")
@@ -190,7 +191,7 @@ def test_a_plain_python_model_agrees_with_the_compiled_one():
     # tried some 400 times, for returns between -200 and 20
     assert plain.values == pytest.approx(compiled.values, abs=18.0)
     assert {plain.tree.observation(c) for c in plain.tree.children(0)} == {"hear left", "hear right"}
-    assert "sees hear" in plain.explain()
+    assert "sees hear" in str(plain.explain())
 
 
 # ---- faces
@@ -200,7 +201,7 @@ def test_a_plan_explains_itself():
     plan = Pomcp(textbook.tiger(), PomcpOptions(simulations=2000, exploration=60.0)).plan([0.0, 1.0], 0)
     text = str(plan)
     assert text.splitlines()[1].startswith("* listen")
-    assert "best line: listen (sees " in text
+    assert "most likely line: listen (sees " in text
     assert "2000 simulations in " in text
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -28,6 +29,8 @@ class TagData(NamedTuple):
     """``[29 * 5 * 12]`` (action * 32 + cell after) of the moves worth trying after (cell, last action), 12 equally likely slots."""
     rollout_steps: NDArray[np.int64]
     """``[1]`` steps simulated inside rollouts, a counter for benchmarks."""
+    seen_values: NDArray[np.float64]
+    """``[29 * 29]`` best return at discount .95 from (robot, target) if the target were always seen."""
 
 
 def tag_data() -> TagData:
@@ -37,7 +40,23 @@ def tag_data() -> TagData:
         chase_maps.target_moves(PLACES),
         chase_maps.rollout_moves(PLACES, stride=32),
         np.zeros(1, dtype=np.int64),
+        _seen_values(),
     )
+
+
+@cache
+def _seen_values() -> NDArray[np.float64]:
+    """By value iteration; what the target hides can only cost."""
+    cells = kernels.CELLS
+    robot = chase_maps.robot_moves(PLACES).reshape(cells, 5).astype(int)
+    target = chase_maps.target_moves(PLACES).reshape(cells, cells, kernels.TARGET_SLOTS).astype(int)
+    values = np.full((cells, cells), 10.0)
+    for _ in range(400):
+        after = np.stack([values[robot[:, a][:, None, None], target].mean(axis=2) for a in range(5)])
+        returns = np.array([-1.0] * 4 + [-10.0])[:, None, None] + 0.95 * after
+        np.fill_diagonal(returns[TAG], 10.0)
+        values = returns.max(axis=0)
+    return np.ascontiguousarray(values.ravel())
 
 
 def tag(rollout: Literal["history", "uniform", "engine"] = "history", preferred: bool = False) -> CompiledModel:
@@ -59,6 +78,7 @@ def tag(rollout: Literal["history", "uniform", "engine"] = "history", preferred:
         rollout=function,
         prior=kernels.preferred if preferred else None,
         action_names=chase_maps.ACTION_NAMES,
+        upper=kernels.seen_value,
     )
 
 

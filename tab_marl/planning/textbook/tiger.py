@@ -7,7 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from tab_marl.planning.model import CompiledModel, table_model
+from tab_marl.planning.model import CompiledModel
+from tab_marl.planning.tables import table_model
 from tab_marl.planning.textbook import tiger_kernels as kernels
 
 LISTEN, OPEN_LEFT, OPEN_RIGHT = 0, 1, 2
