@@ -28,9 +28,11 @@ from tab_marl.field.tab_field import expected_transitions, start_log_partition
 Floats = NDArray[np.float64]
 Message = Callable[[FieldProblem, Tilt], ProductChain]
 
-LARGEST_MULTIPLIER = 200.0
-"""Beyond e^200 a constraint is met only in the limit, if at all."""
+LARGEST_MULTIPLIER = 150.0
+"""Beyond e^150 a constraint is met only in the limit, if at all."""
 SECANT_STEPS = 40
+NEAR = 1e-3
+"""Deviation from which secant steps take over."""
 SUSPICIOUS = 40
 """Passes after which a contradiction is looked for; compatible targets rarely take 25."""
 LEAST_SPREAD = 0.02
@@ -297,7 +299,8 @@ class _Ascent:
         shape = self.base.shape
         weight = self.base + np.asarray(multipliers @ self.features.matrix).reshape(shape)
         self.tilt = Tilt.given(self.problem, weight, self.log_failure)
-        self.chain = self.message(self.problem, self.tilt)
+        with np.errstate(over="ignore"):  # far from the optimum
+            self.chain = self.message(self.problem, self.tilt)
         self.flux = expected_transitions(self.chain, self.problem.automaton.rank)
         self.present = np.asarray(self.features.matrix @ self.flux.ravel())
         self.gap = self.present - self.features.target
@@ -335,6 +338,8 @@ class _Ascent:
 
     def _count(self, _: Floats) -> None:
         self.iterations += 1
+        if np.abs(self.gap).max() < NEAR:
+            raise StopIteration  # line searches would compare values of the dual that differ by rounding only
 
     def _secant(self, at: Floats, inverse: Floats) -> None:
         """Broyden's updates of the inverse Hessian; a step that makes the gradient larger is halved."""

@@ -70,14 +70,17 @@ def look_ahead(q, labels, delta, weight, value, log_scale, modes, ahead):
     base = -math.inf
     for symbol in range(symbols):
         if weight[q, symbol] > 0.0:
-            base = max(base, log_scale[delta[q, symbol]])
+            base = max(base, log_scale[delta[q, symbol]] + math.log(weight[q, symbol]))
     if base == -math.inf:
         ahead[:] = 0.0
         return base
     for cell in range(labels.shape[0]):
         symbol = labels[cell]
         following = delta[q, symbol]
-        factor = weight[q, symbol] * math.exp(log_scale[following] - base)
+        factor = 0.0
+        if weight[q, symbol] > 0.0:
+            # In one exponent: a large weight times rows near the peak would overflow.
+            factor = math.exp(log_scale[following] + math.log(weight[q, symbol]) - base)
         first = cell * modes
         if factor == 0.0:
             for s in range(first, first + modes):
