@@ -6,10 +6,18 @@ from tab_marl.field.contradiction import ContradictoryConstraints
 from tab_marl.field.events import Completes, IsAt, Passes, SoftConstraint, TimingPrior, Tracker
 from tab_marl.field.infeasible import InfeasibleField
 from tab_marl.field.problem import FieldOptions, FieldProblem
-from tab_marl.field.processes import paper_walk, run_and_tumble, walk
+from tab_marl.field.processes import (
+    paper_walk,
+    reference_from_simulator,
+    reference_from_trajectories,
+    run_and_tumble,
+    unicycle,
+    walk,
+)
 from tab_marl.field.reference import Reference, from_matrices
 from tab_marl.field.report import ConstraintFit, FitReport
 from tab_marl.field.sampling import Trajectories, sample_paths
+from tab_marl.field.sizing import FieldSize, FieldTooLarge
 from tab_marl.field.solve import solve
 from tab_marl.field.tab_field import TabField
 
@@ -20,6 +28,8 @@ __all__ = [
     "ContradictoryConstraints",
     "FieldOptions",
     "FieldProblem",
+    "FieldSize",
+    "FieldTooLarge",
     "FitReport",
     "InfeasibleField",
     "IsAt",
@@ -35,8 +45,11 @@ __all__ = [
     "from_matrices",
     "paper_walk",
     "product_chain",
+    "reference_from_simulator",
+    "reference_from_trajectories",
     "run_and_tumble",
     "sample_paths",
     "solve",
+    "unicycle",
     "walk",
 ]

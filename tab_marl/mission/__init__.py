@@ -16,11 +16,14 @@ from tab_marl.mission.automaton import (
 from tab_marl.mission.compile import compile_mission
 from tab_marl.mission.english import to_english
 from tab_marl.mission.feasibility import check_feasible
+from tab_marl.mission.finite import FiniteAutomaton
 from tab_marl.mission.impossible import InfeasibleMission
+from tab_marl.mission.joint import JointAutomaton, compile_joint, conjunction
 from tab_marl.mission.library import MISSIONS
 from tab_marl.mission.model import Constraint, ConstraintType, Mission, Place, place_name
 from tab_marl.mission.monitor import Monitor
 from tab_marl.mission.parse import parse_mission
+from tab_marl.mission.places import MissionWorld
 from tab_marl.mission.route import RouteField, solve_route
 from tab_marl.mission.serialise import (
     MissionFormatError,
@@ -31,7 +34,7 @@ from tab_marl.mission.serialise import (
     mission_to_toml,
 )
 from tab_marl.mission.syntax_errors import MissionSyntaxError
-from tab_marl.mission.unroll import TickAutomaton, unroll
+from tab_marl.mission.unroll import AutomatonTooLarge, TickAutomaton, unroll
 
 __all__ = [
     "ALWAYS_FORBIDDEN",
@@ -41,19 +44,25 @@ __all__ = [
     "NO_BRANCH",
     "UNBOUNDED",
     "AutomatonState",
+    "AutomatonTooLarge",
     "Constraint",
     "ConstraintType",
+    "FiniteAutomaton",
     "InfeasibleMission",
+    "JointAutomaton",
     "Mission",
     "MissionAutomaton",
     "MissionFormatError",
     "MissionSyntaxError",
+    "MissionWorld",
     "Monitor",
     "Place",
     "RouteField",
     "TickAutomaton",
     "check_feasible",
+    "compile_joint",
     "compile_mission",
+    "conjunction",
     "load_mission",
     "mission_from_json",
     "mission_from_toml",

@@ -22,15 +22,15 @@ from tab_marl.mission.automaton import (
 )
 from tab_marl.mission.compile import compile_mission
 from tab_marl.mission.model import Constraint, ConstraintType, Mission, Place, place_name
+from tab_marl.mission.places import MissionWorld
 from tab_marl.mission.propositions import region_of
 from tab_marl.world.regions import BOUNDARY_METRES, Box, Disc, Region
-from tab_marl.world.scenario import Scenario
 
 # A body that is commanded at the limit overshoots a little; this share above the limit is no violation.
 SPEED_TOLERANCE = 0.02
 
 Point = Sequence[float] | np.ndarray[tuple[int], np.dtype[np.float64]]
-"""x, y in metres."""
+"""x, y (in space also z) in metres."""
 Status = Literal["active", "completed", "failed"]
 
 
@@ -40,7 +40,7 @@ class Monitor:
     def __init__(
         self,
         mission: Mission,
-        scenario: Scenario,
+        scenario: MissionWorld,
         tick_seconds: float,
         automaton: MissionAutomaton | None = None,
     ) -> None:
@@ -101,7 +101,7 @@ class Monitor:
         return float(self.automaton.speed_limit[self.location]) if self.location >= 0 else math.inf
 
     def reset(self, point: Point) -> Status:
-        """Begin with the robot's centre at `point` (x, y) metres at tick 0."""
+        """Begin with the robot's centre at `point` metres at tick 0."""
         self._clocks[:] = BEFORE_START
         self._state = AutomatonState(self.automaton.initial, BEFORE_START)
         self._tick, self._done, self._why = -1, 0, ""
@@ -123,10 +123,10 @@ class Monitor:
             self._state = AutomatonState(FAILED, before.clocks)
             self._why = f"drove {speed:.2f} m/s at {self._now}, where at most {limit:g} m/s is allowed"
             return self.status
-        x, y = point
+        at = (*point,)
         mask = 0
         for bit, inside in enumerate(self._inside_proposition):
-            if inside(x, y):
+            if inside(*at):
                 mask |= 1 << bit
         location = kernels.advance(*self.automaton.tables, before.location, self._clocks, mask)
         first, second, third = self._clocks.tolist()
@@ -193,7 +193,7 @@ class Monitor:
         return f"missed {_goal_words(goal)}{visit}: at most {allowed} after {since}"
 
 
-def _membership(region: Region) -> Callable[[float, float], bool]:
+def _membership(region: Region) -> Callable[..., bool]:
     """`Region.contains` for one point at a time, without the cost of small arrays: an environment asks at every step."""
     if isinstance(region, Disc):
         x, y, reach = region.x, region.y, region.radius + BOUNDARY_METRES
@@ -207,7 +207,7 @@ def _membership(region: Region) -> Callable[[float, float], bool]:
             return math.hypot(max(left - px, px - right, 0.0), max(bottom - py, py - top, 0.0)) <= BOUNDARY_METRES
 
         return in_box
-    return lambda px, py: bool(region.contains((px, py)))
+    return lambda *point: bool(region.contains(point))
 
 
 def _counts_from_start(constraint: Constraint) -> bool:

@@ -1,7 +1,15 @@
 """Reference processes: what motion is like when nothing but physics is known."""
 
+from tab_marl.field.processes.estimated import reference_from_simulator, reference_from_trajectories
 from tab_marl.field.processes.isotropic import paper_walk, walk
 from tab_marl.field.processes.tumble import run_and_tumble
 from tab_marl.field.processes.unicycle import unicycle
 
-__all__ = ["paper_walk", "run_and_tumble", "unicycle", "walk"]
+__all__ = [
+    "paper_walk",
+    "reference_from_simulator",
+    "reference_from_trajectories",
+    "run_and_tumble",
+    "unicycle",
+    "walk",
+]

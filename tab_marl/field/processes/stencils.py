@@ -42,6 +42,9 @@ class Cells(Protocol):
     def centres(self) -> NDArray[np.float64]:
         """``[S, D]`` metres, x first."""
 
+    def cells_of(self, points: ArrayLike) -> NDArray[np.int32]:
+        """``[N]``: the free cell nearest to each point ``[N, D]``."""
+
 
 class Stencil(NamedTuple):
     """Where one cell's mass goes, relative to it."""
