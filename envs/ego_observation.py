@@ -143,6 +143,23 @@ class AdversaryView:
     w: float
 
 
+def parse_adversaries(observation: ArrayLike, adversaries: int) -> tuple[AdversaryView | None, ...]:
+    """Every adversary in an ego observation of an arena with so many; None for those that no camera sees.
+
+    Raises ValueError if the observation is too short for them.
+    """
+    array = np.asarray(observation, dtype=np.float32)
+    end = _SEEN + 7 * adversaries
+    if array.ndim != 1 or array.shape[0] < end:
+        raise ValueError(
+            f"an ego observation with {adversaries} adversaries has {end} rows or more, got {list(array.shape)}"
+        )
+    blocks = array[_SEEN:end].reshape(adversaries, 7).tolist()
+    return tuple(
+        AdversaryView(x, y, math.atan2(sin, cos), v, w) if seen > 0.5 else None for seen, x, y, cos, sin, v, w in blocks
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class EgoView:
     """An ego observation with names: metres, rad in [-pi, pi], m/s, rad/s, seconds."""
@@ -168,7 +185,7 @@ def parse_ego_observation(observation: ArrayLike, scenario: Scenario | None = No
     """Read an ego observation by name. Raises ValueError on a wrong shape.
 
     `scenario`: needed where the ego has a goal of its own (avoidance); without it all rows after the first 15 are read as
-    lidar.
+    lidar. With several adversaries use `parse_adversaries`.
     """
     array = np.asarray(observation, dtype=np.float32)
     if array.ndim != 1 or array.shape[0] < ROWS_WITHOUT_LIDAR:

@@ -116,6 +116,11 @@ class InterceptEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
         """The task of the running episode."""
         return self.episode.task
 
+    @property
+    def ego_task(self) -> EgoTask:
+        """What the ego is paid for."""
+        return self._shape_of.ego_task
+
     def spawn_generator(self) -> np.random.Generator:
         """A generator of its own that follows from the seed of the last seeded reset: for opponents."""
         return self._rng.spawn(1)[0]

@@ -6,8 +6,13 @@ name        side        what it does
 static      either      stands still
 random      either      a new random action every half second
 follow      adversary   follows the route that its observation shows, and waits where it would be too early
-pursue      ego         drives to where a camera last saw the adversary, round obstacles, and waits there
+pursue      ego         drives to where a camera last saw the adversary, round obstacles, and waits there; of several
+                        it takes the one nearest to itself
+arrive      ego         drives to its own goal round obstacles (ego task avoidance), whatever the adversary does
 ==========  ==========  ==============================================================================================
+
+Any other name is handed to the loader that `registration.register_all` was given: with `import tab_marl`, the name of a zoo
+policy (adversary) or of a planner (ego), the folder of a policy, or a stable-baselines3 model's zip file (either side).
 
 An object may also have `reset(task, rng)`, called at the start of every episode.
 """
@@ -16,14 +21,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from importlib import import_module
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tab_marl.envs import adversary_kernels as rows
-from tab_marl.envs.ego_observation import parse_ego_observation
+from tab_marl.envs.ego_observation import EgoView, parse_adversaries, parse_ego_observation
 from tab_marl.envs.lidar import Lidar
+from tab_marl.envs.registration import opponent_loader
 from tab_marl.mission.tasks import Task
 from tab_marl.world.grid import GridMap
 from tab_marl.world.kernels import steer
@@ -101,8 +108,8 @@ class Follow:
         return follow_route(observation, self._turn_per_step)
 
 
-class Pursue:
-    """Drives to the latest sighting by the shortest free way."""
+class _Driver:
+    """Drives round obstacles by the shortest free way."""
 
     def reset(self, task: Task, rng: np.random.Generator) -> None:
         self._scenario = task.scenario
@@ -116,11 +123,11 @@ class Pursue:
         self._to_go: NDArray[np.float64] | None = None
         self._step = 0
 
-    def act(self, observation: NDArray[np.float32]) -> Action:
-        view = parse_ego_observation(observation)
-        if view.adversary is not None and (self._to_go is None or self._step % self._replan == 0):
-            self._target = (view.adversary.x, view.adversary.y)
-            self._to_go = self._grid.distances(self._grid.cells_of([self._target]))
+    def _head_for(self, target: tuple[float, float]) -> None:
+        self._target = target
+        self._to_go = self._grid.distances(self._grid.cells_of([target]))
+
+    def _drive(self, view: EgoView) -> Action:
         self._step += 1
         if self._target is None or self._to_go is None:
             return STAND_STILL
@@ -151,6 +158,40 @@ class Pursue:
         return all(self._lidar.sees(x + s * ox, y + s * oy, to_x + s * ox, to_y + s * oy) for s in (-1.0, 0.0, 1.0))
 
 
+class Pursue(_Driver):
+    """Drives to the latest sighting; of several adversaries, to the seen one that is nearest."""
+
+    def __init__(self, adversaries: int = 1) -> None:
+        self._adversaries = adversaries
+
+    def act(self, observation: NDArray[np.float32]) -> Action:
+        view = parse_ego_observation(observation)
+        shown = view.adversary
+        if self._adversaries > 1:
+            seen = [a for a in parse_adversaries(observation, self._adversaries) if a is not None]
+            shown = min(seen, key=lambda a: math.hypot(a.x - view.x, a.y - view.y), default=None)
+        if shown is not None and (self._to_go is None or self._step % self._replan == 0):
+            self._head_for((shown.x, shown.y))
+        return self._drive(view)
+
+
+class Arrive(_Driver):
+    """Drives to the ego's own goal."""
+
+    def reset(self, task: Task, rng: np.random.Generator) -> None:
+        super().reset(task, rng)
+        goal = task.scenario.ego_goal
+        if goal is None:
+            raise ValueError(
+                f"the scripted ego 'arrive' needs a goal, scenario {task.scenario.name!r} has none: its ego_task is "
+                f"{task.scenario.ego_task!r}, must be 'avoidance'"
+            )
+        self._head_for(goal.centre)
+
+    def act(self, observation: NDArray[np.float32]) -> Action:
+        return self._drive(parse_ego_observation(observation))
+
+
 class Function:
     """A plain function of the observation, as a player."""
 
@@ -161,23 +202,50 @@ class Function:
         return np.asarray(self._function(observation), dtype=np.float32)
 
 
+class Model:
+    """A stable-baselines3 model, or whatever else has `predict(observation) -> (action, state)`, as a player."""
+
+    def __init__(self, model: Any) -> None:
+        self._model = model
+
+    def act(self, observation: NDArray[np.float32]) -> Action:
+        return np.asarray(self._model.predict(observation, deterministic=True)[0], dtype=np.float32)
+
+
 OPPONENTS: dict[str, dict[str, Callable[[], Player]]] = {
-    "ego": {"static": Static, "random": Random, "pursue": Pursue},
+    "ego": {"static": Static, "random": Random, "pursue": Pursue, "arrive": Arrive},
     "adversary": {"static": Static, "random": Random, "follow": Follow},
 }
 """Side -> name -> player."""
 
+Opponent = str | Player | Callable[[NDArray[np.float32]], Any]
 
-def make_opponent(opponent: str | Player | Callable[[NDArray[np.float32]], Any], side: str) -> Player:
-    """The player of a side. Raises UnknownName for a name it lacks, TypeError for what cannot act."""
+
+def make_opponent(opponent: Opponent | Any, side: str, adversaries: int = 1) -> Player:
+    """The player of a side, in an arena with so many adversaries.
+
+    `opponent`: a scripted player's name, another name for the registered loader, an object with `act(observation)`, a
+    stable-baselines3 model, or a function of the observation. Raises UnknownName for a name that nobody knows, TypeError for
+    what cannot act.
+    """
     if isinstance(opponent, str):
-        if opponent not in OPPONENTS[side]:
+        if opponent == "pursue" and side == "ego":
+            return Pursue(adversaries)
+        if opponent in OPPONENTS[side]:
+            return OPPONENTS[side][opponent]()
+        loader = opponent_loader()
+        if loader is None:
             raise UnknownName(f"scripted {side}", opponent, OPPONENTS[side])
-        return OPPONENTS[side][opponent]()
+        module, function = loader.split(":")
+        loaded: Player = getattr(import_module(module), function)(opponent, side)
+        return loaded
     if isinstance(opponent, Player):
         return opponent
+    if hasattr(opponent, "predict"):
+        return Model(opponent)
     if callable(opponent):
         return Function(opponent)
     raise TypeError(
-        f"opponent is {opponent!r}, must be one of {list(OPPONENTS[side])}, have act(observation), or be a function"
+        f"opponent is {opponent!r}, must be one of {list(OPPONENTS[side])}, have act(observation) or predict(observation), or "
+        "be a function"
     )

@@ -37,6 +37,7 @@ from tab_marl.envs.styles import Style
 from tab_marl.envs.team_episode import TeamEpisode, TeamEvents, draw_team_starts
 from tab_marl.envs.team_source import TeamSource, team_source
 from tab_marl.mission import Mission
+from tab_marl.mission.tasks import Task
 from tab_marl.mission.teams import TeamTask
 from tab_marl.world.scenario import Scenario
 
@@ -121,6 +122,11 @@ class TeamEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
     def task(self) -> TeamTask:
         """The task of the running episode."""
         return self.episode.team
+
+    def task_of(self, agent: str) -> Task:
+        """What an agent plays: an adversary its own task, an ego the first adversary's."""
+        tasks = self.episode.team.tasks
+        return tasks[self.adversary_agents.index(agent)] if agent in self.adversary_agents else tasks[0]
 
     def spawn_generator(self) -> np.random.Generator:
         """A generator of its own that follows from the seed of the last seeded reset: for opponents."""

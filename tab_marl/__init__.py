@@ -91,7 +91,7 @@ def __dir__() -> list[str]:
 def _register_environments() -> None:
     from tab_marl.envs.registration import register_all
 
-    register_all()
+    register_all(opponent_loader="tab_marl.agents.opponents:load_opponent")
 
 
 _register_environments()
