@@ -20,7 +20,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -74,6 +74,19 @@ class PlannerOptions:
             raise ValueError(f"PlannerOptions.particles is {self.particles}, must be >= 1")
 
 
+class DecisionParts(NamedTuple):
+    """Where a decision's time went: processor seconds of the planner's thread, which other jobs do not disturb."""
+
+    belief: float
+    """Updating it, over all ticks since the last decision."""
+    sampling: float
+    """Drawing adversary paths from it."""
+    valuation: float
+    """Of itineraries against these."""
+    search: float
+    """The tree."""
+
+
 class EgoAgent(Protocol):
     """Whatever can drive the ego."""
 
@@ -111,6 +124,7 @@ class PlannerAgent:
         self.options = options
         self.full_observation = name == "oracle"
         self.decision_seconds: list[float] = []
+        self.decision_parts: list[DecisionParts] = []
         self.decision: Decision | None = None
         self.moves = untrained() if name == "MLE-POMCP" else None
         self._model: AdversaryModel | None = None
@@ -124,7 +138,8 @@ class PlannerAgent:
         guarded = prior > 0
         self._model = Guarded(model, MissionMap.build(scenario, task.mission), prior) if guarded else model
         self._scenarios = ScenarioSet(scenario, self.options.pursuit.paths, self.options.reuse)
-        self.decision, self.decision_seconds = None, []
+        self.decision, self.decision_seconds, self.decision_parts = None, [], []
+        self._belief_seconds = 0.0
         self._steps_per_tick = round(scenario.step_seconds * scenario.control_hertz)
         self._steps_per_decision = scenario.control_hertz // scenario.decision_hertz
         self._step = 0
@@ -139,7 +154,9 @@ class PlannerAgent:
             self._track.append((seen.x, seen.y))
         started = time.perf_counter()
         if self._step % self._steps_per_tick == 0:
+            update_began = time.thread_time()
             self._update(view)
+            self._belief_seconds += time.thread_time() - update_began
         if self._step % self._steps_per_decision == 0:
             self._decide(view)
             self.decision_seconds.append(time.perf_counter() - started)
@@ -200,10 +217,16 @@ class PlannerAgent:
         scenario, pursuit = self.task.scenario, self.options.pursuit
         left = scenario.horizon_ticks - self._step // self._steps_per_tick
         ticks = max(2, min(round(pursuit.horizon_seconds / scenario.step_seconds), left))
+        began = time.thread_time()
         sampled = self._scenarios.draw(self._model, ticks, left, self.rng)
+        sampling = time.thread_time() - began
         per_decision = self._steps_per_decision // self._steps_per_tick
         current = None if self.decision is None else self.decision.itinerary.later(per_decision)
-        self.decision = decide(self.routes, (view.x, view.y, view.theta), sampled, current, pursuit, self.rng)
+        chosen = decide(self.routes, (view.x, view.y, view.theta), sampled, current, pursuit, self.rng)
+        self.decision_parts.append(
+            DecisionParts(self._belief_seconds, sampling, chosen.valuation_seconds, chosen.search_seconds)
+        )
+        self.decision, self._belief_seconds = chosen, 0.0
 
 
 def untrained() -> MoveCounts:

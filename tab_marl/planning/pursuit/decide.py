@@ -6,6 +6,7 @@ depending on what cameras will have seen, and starts from those values.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -34,9 +35,9 @@ class Contacts(NamedTuple):
     distances: NDArray[np.float64]
     """``[W, S]`` metres from every cell to every waypoint."""
     first: NDArray[np.float64]
-    """``[2 m, K]`` first tick within meeting distance of the waypoints of first, then of second legs; inf if never."""
+    """``[K, 2 m]`` first tick within meeting distance of the waypoints of first, then of second legs; inf if never."""
     last: NDArray[np.float64]
-    """``[2 m, K]`` last such tick, -1 if never."""
+    """``[K, 2 m]`` last such tick, -1 if never."""
 
 
 class PursuitData(NamedTuple):
@@ -63,6 +64,8 @@ class PursuitData(NamedTuple):
     """Meeting radius, square, closing per tick, ticks of a macro-action, pseudo-counts of any route and of keeping on,
     distance of paths that look alike, switches in a rollout, what a switch must gain, 1 to branch on sightings."""
     contacts: Contacts
+    driven: NDArray[np.float64]
+    """``[m, T + 1, 5]`` of each itinerary from the present pose: x, y, theta, effort so far, 1 once it stands for good."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +79,10 @@ class Decision:
     """Of the candidates, followed without a change of mind."""
     plan: Plan | None
     """None without a tree; its action a is ``candidates[a]``."""
+    valuation_seconds: float = 0.0
+    """Processor time that valuing itineraries took."""
+    search_seconds: float = 0.0
+    """Processor time that the tree took."""
 
     @property
     def route(self) -> int:
@@ -100,17 +107,20 @@ def pursuit_model(
     completed = np.ascontiguousarray(sampled.completed_tick, dtype=np.int32)
     first, switch, second = np.array(candidates, dtype=np.int64).T.copy()
     points = np.concatenate([routes.waypoints, [pose[:2]]])[np.concatenate([first, second])]
-    contacts = Contacts(routes.distances, *np.empty((2, len(points), len(paths))))
+    contacts = Contacts(routes.distances, *np.empty((2, len(paths), len(points))))
     decide_kernels.contacts(paths, completed, points, radius, contacts.first, contacts.last)
+    robot = (
+        scenario.ego.max_speed, scenario.ego.max_turn_rate, 1.0 / scenario.control_hertz,
+        float(routes.control_steps_per_tick),
+    )  # fmt: skip
+    driven = np.empty((len(first), paths.shape[1], 5))
+    decide_kernels.tracks(*pose, (first, switch, second), geometry_of(routes), robot, driven)
     data = PursuitData(
         paths,
         completed,
         np.array([(c.x, c.y, c.camera_metres) for c in scenario.checkpoints], dtype=np.float64).reshape(-1, 3),
         geometry_of(routes),
-        (
-            scenario.ego.max_speed, scenario.ego.max_turn_rate, 1.0 / scenario.control_hertz,
-            float(routes.control_steps_per_tick),
-        ),
+        robot,
         (
             rewards.interception, rewards.per_step, rewards.control, rewards.mission_completed,
         ),
@@ -123,9 +133,10 @@ def pursuit_model(
             options.switch_bonus, float(options.branch_on_sightings),
         ),
         contacts,
+        driven,
     )  # fmt: skip
     return CompiledModel(
-        decide_kernels.step, len(first), 5, data, rollout=decide_kernels.rollout, prior=decide_kernels.prior
+        decide_kernels.step, len(first), 6, data, rollout=decide_kernels.rollout, prior=decide_kernels.prior
     )
 
 
@@ -138,16 +149,19 @@ def decide(
     rng: np.random.Generator,
 ) -> Decision:
     """Choose from (x, y, theta) against sampled adversary paths; `current` is what is being followed, seen from now."""
+    began = time.thread_time()
     found = shortlist(routes, pose, sampled, current, options)
+    valued = time.thread_time()
     if options.method == "routes":
         best = int(np.argmax(found.values.mean + found.bonus))
-        return Decision(found.itineraries[best], found.itineraries, found.values, None)
+        return Decision(found.itineraries[best], found.itineraries, found.values, None, valued - began)
     model = pursuit_model(routes, pose, sampled, found.values, found.itineraries, options)
     plan = _search(model, pose, found.values, options, routes.scenario, rng)
     # A value met by few simulations is luck: the search tries what it holds good often.
     tried = plan.visits >= TRIED_SHARE * plan.visits.max()
     best = int(np.argmax(np.where(tried, plan.values + found.bonus, -np.inf)))
-    return Decision(found.itineraries[best], found.itineraries, found.values, plan)
+    searched = time.thread_time()
+    return Decision(found.itineraries[best], found.itineraries, found.values, plan, valued - began, searched - valued)
 
 
 def _search(
@@ -168,8 +182,8 @@ def _search(
         max_depth=ticks + 1,
         tree_depth=min(int(options.tree_seconds / scenario.step_seconds / macro), ticks),
     )
-    states = np.zeros((scenarios, 5))
+    states = np.zeros((scenarios, 6))
     states[:, 0] = np.arange(scenarios)
-    states[:, 2:] = pose
+    states[:, 2:5] = pose
     counts = np.full(model.actions, options.root_count)
     return Pomcp(model, search).plan(states, rng, prior_values=values.mean, prior_counts=counts)

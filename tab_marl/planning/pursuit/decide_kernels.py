@@ -1,8 +1,9 @@
 # mypy: ignore-errors
 """The pursuit as a generative model for POMCP: actions are itineraries of the ego, states an adversary path and a pose.
 
-Arrays and scalars only; nothing here validates or raises. `data` is the tuple `pursuit.PursuitData`. A state is
-``[path number, tick, x, y, theta]``.
+Arrays and scalars only; nothing here validates or raises. `data` is the tuple `decide.PursuitData`. A state is
+``[path number, tick, x, y, theta, track]``: track a >= 0 says that the pose is the one at this tick of itinerary a driven
+from the root, which is looked up instead of driven again (`tracks`); -1 that it is any other.
 
 What a sighting tells is estimated from the sampled paths themselves: those that are near the seen point at that tick
 are what the adversary may be doing, and each route is judged by how many of them it reaches ahead of time (`prospects`).
@@ -21,6 +22,9 @@ from tab_marl.world.kernels import unicycle_step
 
 UNSEEN = 0
 ENDED = -1
+OFF_TRACK = -1.0
+ALIKE_ENOUGH = 100
+"""Paths that look alike are asked up to so many."""
 TURN_TICKS = 2.0
 """Allowed for turning when a route's arrival is estimated."""
 
@@ -70,24 +74,54 @@ def route_at(action, tick, itineraries):
 
 
 @njit(cache=True)
+def tracks(x, y, theta, itineraries, geometry, robot, found):
+    """Fill `found` ``[m, T + 1, 5]``: x, y, theta, effort so far, and 1 from the tick on at which it stands for good."""
+    for a in range(found.shape[0]):
+        px, py, heading, total, arrived = x, y, theta, 0.0, False
+        found[a, 0, 0], found[a, 0, 1], found[a, 0, 2], found[a, 0, 3], found[a, 0, 4] = px, py, heading, 0.0, 0.0
+        for t in range(found.shape[1] - 1):
+            if not arrived:
+                route = route_at(a, t, itineraries)
+                px, py, heading, spent, still = drive_tick(px, py, heading, route, geometry, robot)
+                total += spent
+                arrived = still and t >= itineraries[1][a]
+            found[a, t + 1, 0], found[a, t + 1, 1], found[a, t + 1, 2] = px, py, heading
+            found[a, t + 1, 3], found[a, t + 1, 4] = total, 1.0 if arrived else 0.0
+
+
+@njit(cache=True)
+def move_on(x, y, theta, t, action, on_track, data):
+    """`drive_tick` along an itinerary, looked up where the pose is on its track; the last says that it stands for good."""
+    if on_track:
+        driven = data[11]
+        return (
+            driven[action, t + 1, 0], driven[action, t + 1, 1], driven[action, t + 1, 2],
+            driven[action, t + 1, 3] - driven[action, t, 3], driven[action, t + 1, 4] > 0.0,
+        )  # fmt: skip
+    itineraries = data[6]
+    to_x, to_y, to_theta, spent, still = drive_tick(x, y, theta, route_at(action, t, itineraries), data[3], data[4])
+    return to_x, to_y, to_theta, spent, still and t >= itineraries[1][action]
+
+
+@njit(cache=True)
 def pursue(state, action, ticks, data):
     """Follow an itinerary for so many ticks, or until cameras begin or cease to see the adversary; moves `state` in place.
 
     Returns (observation, reward, whether the scenario ended).
     """
-    paths, completed, cameras, geometry, robot, prices, itineraries, _open_loop, _baseline, search, _ways = data
+    paths, completed, cameras, prices, search = data[0], data[1], data[2], data[5], data[9]
     met, per_tick, per_effort, mission_completed = prices
     radius, square = search[0], search[1]
     k, t = int(state[0]), int(state[1])
     x, y, theta = state[2], state[3], state[4]
+    on_track = t == 0 or state[5] == action
     last, ends = last_tick(completed[k], paths.shape[1] - 1)
     visible = sight_code(paths[k, t, 0], paths[k, t, 1], cameras, square) != UNSEEN
     reward, seen, over = 0.0, UNSEEN, t >= last
     for _ in range(ticks):
         if over:
             break
-        route = route_at(action, t, itineraries)
-        to_x, to_y, theta, spent, _still = drive_tick(x, y, theta, route, geometry, robot)
+        to_x, to_y, theta, spent, _still = move_on(x, y, theta, t, action, on_track, data)
         s = meeting_fraction(
             x - paths[k, t, 0], y - paths[k, t, 1], to_x - paths[k, t + 1, 0], to_y - paths[k, t + 1, 1], radius
         )
@@ -100,6 +134,7 @@ def pursue(state, action, ticks, data):
         if (seen != UNSEEN) != visible:
             break
     state[1], state[2], state[3], state[4] = t, x, y, theta
+    state[5] = action if on_track else OFF_TRACK
     if over:
         return ENDED, reward + (mission_completed if ends else 0.0), True
     return seen, reward, False
@@ -108,16 +143,16 @@ def pursue(state, action, ticks, data):
 @njit(cache=True)
 def wait_for(state, action, data):
     """The return of following an itinerary to its end and waiting there, from a state on."""
-    paths, completed, _cameras, geometry, robot, prices, itineraries, _open_loop, _baseline, search, _ways = data
+    paths, completed, prices, search = data[0], data[1], data[5], data[9]
     met, per_tick, per_effort, mission_completed = prices
     radius, closing = search[0], search[2]
     k, t = int(state[0]), int(state[1])
     x, y, theta = state[2], state[3], state[4]
+    on_track = t == 0 or state[5] == action
     last, ends = last_tick(completed[k], paths.shape[1] - 1)
     reward = 0.0
     while t < last:
-        route = route_at(action, t, itineraries)
-        to_x, to_y, theta, spent, still = drive_tick(x, y, theta, route, geometry, robot)
+        to_x, to_y, theta, spent, still = move_on(x, y, theta, t, action, on_track, data)
         s = meeting_fraction(
             x - paths[k, t, 0], y - paths[k, t, 1], to_x - paths[k, t + 1, 0], to_y - paths[k, t + 1, 1], radius
         )
@@ -125,7 +160,7 @@ def wait_for(state, action, data):
             return reward + met + s * (per_tick + per_effort * spent)
         x, y, t = to_x, to_y, t + 1
         reward += per_tick + per_effort * spent
-        if still and route == itineraries[2][action]:
+        if still:
             break
     while t < last:
         ax, ay = x - paths[k, t, 0], y - paths[k, t, 1]
@@ -150,10 +185,13 @@ def prospects(state, kept, alike_metres, leave_out, data, values):
     A path looks alike if it is within `alike_metres` of the state's path at this tick. Meetings count at the waypoint of
     the leg in force only (the ego arrives by the geodesic distance and a turn, and the path must still come by), except for
     the itinerary `kept` so far, whose return is known. So a change must beat what is certain by what is guaranteed.
-    `leave_out` leaves the state's own path out, so that a choice made by these values is blind to it.
+    `leave_out` leaves the state's own path out, so that a choice made by these values is blind to it. Paths are asked in
+    turn from the state's own on, until `ALIKE_ENOUGH` were alike (they are in no order).
     Returns how many paths were alike; `values` is untouched if none was.
     """
-    paths, completed, _cameras, geometry, robot, prices, itineraries, open_loop, _baseline, _search, ways = data
+    paths, completed, _cameras, geometry, robot, prices, itineraries, open_loop, _baseline, _search, ways, _driven = (
+        data
+    )
     met, per_tick, _per_effort, mission_completed = prices
     distances, first_contact, last_contact = ways
     nearest, cell_metres = geometry[0], geometry[1]
@@ -163,8 +201,17 @@ def prospects(state, kept, alike_metres, leave_out, data, values):
     r = min(max(int(state[3] / cell_metres), 0), nearest.shape[0] - 1)
     c = min(max(int(state[2] / cell_metres), 0), nearest.shape[1] - 1)
     cell = nearest[r, c]
+    # Which leg is in force, and when its waypoint is reached, is the same for all paths.
+    rows, arrivals = np.empty(actions, dtype=np.int64), np.empty(actions)
+    for a in range(actions):
+        route = route_at(a, t, itineraries)
+        rows[a] = a if t < itineraries[1][a] else actions + a
+        arrivals[a] = t + (0.0 if route == distances.shape[0] else distances[route, cell] / reach + TURN_TICKS)
     alike = 0
-    for j in range(paths.shape[0]):
+    for i in range(paths.shape[0]):
+        if alike == ALIKE_ENOUGH:
+            break
+        j = k + i if k + i < paths.shape[0] else k + i - paths.shape[0]
         last, ends = last_tick(completed[j], paths.shape[1] - 1)
         dx, dy = paths[j, t, 0] - paths[k, t, 0], paths[j, t, 1] - paths[k, t, 1]
         if (leave_out and j == k) or last <= t or dx * dx + dy * dy > alike_metres * alike_metres:
@@ -172,18 +219,13 @@ def prospects(state, kept, alike_metres, leave_out, data, values):
         if alike == 0:
             values[:] = 0.0
         alike += 1
+        missed = per_tick * (last - t) + (mission_completed if ends else 0.0)
         for a in range(actions):
             if a == kept:
                 values[a] += open_loop[a, j] - per_tick * t
                 continue
-            route = route_at(a, t, itineraries)
-            row = a if t < itineraries[1][a] else actions + a
-            travel = 0.0 if route == distances.shape[0] else distances[route, cell] / reach + TURN_TICKS
-            arrival = max(t + travel, first_contact[row, j])
-            if last_contact[row, j] >= arrival:
-                values[a] += met + per_tick * (arrival - t)
-            else:
-                values[a] += per_tick * (last - t) + (mission_completed if ends else 0.0)
+            arrival = max(arrivals[a], first_contact[j, rows[a]])
+            values[a] += met + per_tick * (arrival - t) if last_contact[j, rows[a]] >= arrival else missed
     if alike > 0:
         values /= alike
     return alike
@@ -191,19 +233,19 @@ def prospects(state, kept, alike_metres, leave_out, data, values):
 
 @njit(cache=True)
 def contacts(paths, completed, points, radius, first, last):
-    """Fill ``[m, K]``: the first and last tick at which each path is within `radius` of each point, before it ends; inf
+    """Fill ``[K, m]``: the first and last tick at which each path is within `radius` of each point, before it ends; inf
     and -1 if never.
     """
-    for a in range(points.shape[0]):
-        for k in range(paths.shape[0]):
-            first[a, k], last[a, k] = np.inf, -1.0
-            end, _ends = last_tick(completed[k], paths.shape[1] - 1)
+    for k in range(paths.shape[0]):
+        end, _ends = last_tick(completed[k], paths.shape[1] - 1)
+        for a in range(points.shape[0]):
+            first[k, a], last[k, a] = np.inf, -1.0
             for t in range(end + 1):
                 dx, dy = paths[k, t, 0] - points[a, 0], paths[k, t, 1] - points[a, 1]
                 if dx * dx + dy * dy <= radius * radius:
-                    if last[a, k] < 0.0:
-                        first[a, k] = t
-                    last[a, k] = t
+                    if last[k, a] < 0.0:
+                        first[k, a] = t
+                    last[k, a] = t
 
 
 @njit(cache=True)

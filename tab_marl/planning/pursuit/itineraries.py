@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,6 +77,17 @@ class PursuitOptions:
     radius_share: float = 1.0
     """Paths are met at this share of the interception distance: below 1 asks for a margin."""
 
+    @classmethod
+    def for_milliseconds(cls, milliseconds: float, **changes: Any) -> PursuitOptions:
+        """The options whose decisions take about so long on one core (2026), the belief's update of about 1 ms included.
+
+        Work is set, not time: the same seed gives the same decision on every machine. `EFFORT` lists the steps; the
+        dearest that fits is taken, the cheapest if none does.
+        """
+        fitting = [effort for effort in EFFORT if effort.milliseconds <= milliseconds] or [EFFORT[0]]
+        chosen = {name: value for name, value in fitting[-1]._asdict().items() if name != "milliseconds"}
+        return cls(**(chosen | changes))
+
     def __post_init__(self) -> None:
         if self.method not in ("tree", "routes"):
             raise ValueError(f"PursuitOptions.method is {self.method!r}, must be 'tree' or 'routes'")
@@ -108,6 +119,31 @@ class PursuitOptions:
         ):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"PursuitOptions.{name} is {getattr(self, name)}, must be >= 0")
+
+
+class Effort(NamedTuple):
+    """How much of everything a decision of so many milliseconds can afford."""
+
+    milliseconds: float
+    paths: int
+    screening_paths: int
+    screened: int
+    detours: int
+    detour_paths: int
+    candidates: int
+    simulations: int
+
+
+EFFORT = (
+    Effort(2, 20, 20, 12, 0, 1, 4, 10),
+    Effort(5, 60, 30, 16, 6, 30, 6, 40),
+    Effort(10, 200, 60, 30, 12, 60, 8, 150),
+    Effort(20, 400, 100, 40, 24, 80, 12, 300),
+    Effort(50, 800, 150, 60, 32, 150, 12, 1000),
+    Effort(200, 2000, 300, 90, 48, 300, 16, 5000),
+    Effort(1000, 4000, 500, 200, 64, 500, 16, 40000),
+)
+"""What `PursuitOptions.for_milliseconds` chooses from."""
 
 
 class Geometry(NamedTuple):

@@ -56,7 +56,7 @@ def test_steps_and_rollout_add_up_to_the_open_loop_return(macro_seconds: float) 
     for a in range(len(candidates)):
         for k in range(40):
             for macros in (0, 1, 3, 100):
-                state = np.array([float(k), 0.0, *POSE])
+                state = np.array([float(k), 0.0, *POSE, -1.0])
                 total, over = 0.0, False
                 for _ in range(macros):
                     _seen, reward, over = step(state, a, model.data, np.zeros(1, dtype=np.uint64))
@@ -80,7 +80,7 @@ def test_macro_actions_stop_when_a_camera_begins_to_see() -> None:
     values = value_routes(table, sampled.positions, sampled.completed_tick, LAB.rewards, 0.3)
     options = PursuitOptions(macro_seconds=30.0, branch_on_sightings=True)
     model = pursuit_model(MAP, POSE, sampled, values, candidates, options)
-    state = np.array([0.0, 0.0, *POSE])
+    state = np.array([0.0, 0.0, *POSE, -1.0])
     seen, _reward, over = njit(decide_kernels.step)(state, 0, model.data, np.zeros(1, dtype=np.uint64))
     entered = int(np.argmax(np.hypot(*(line - (camera.x, camera.y)).T) <= camera.camera_metres))
     assert seen != decide_kernels.UNSEEN and not over
