@@ -20,6 +20,15 @@
 of data and cached on disk, so keep dtypes, dimensions and memory order the same from call to call, and let arrays be writable
 and C-contiguous. `rng` is uint64[1] for `tab_marl.planning.random_kernels`. Return ``np.int64`` observations, float rewards, bool terminals.
 
+**Continuous observations** (`ContinuousModel`, for `tab_marl.planning.pomcpow.Pomcpow`): compiled functions again, but
+
+``step(state, action, data, rng, observation) -> (reward, terminal)``
+    Changes `state` and writes into `observation`, float64[O].
+``likelihood(before, action, after, observation, data) -> float``
+    The density (or probability, or a multiple of it) of the observation after that step; > 0 for one that `step` wrote.
+``rollout(state, action, observation, depth, max_depth, discount, data, rng) -> float`` (optional)
+    As above, with the observation a vector.
+
 **Tables** (`tab_marl.planning.tables.table_model`): transition, observation and reward arrays, dense or sparse; a compiled model.
 
 **Plain Python** (`PythonModel`): any class with ``step``; some hundred times slower, for small problems and for debugging.
@@ -98,12 +107,53 @@ class CompiledModel:
         return callback(_plain(self.upper), signature)
 
 
+@dataclass(frozen=True, eq=False)
+class ContinuousModel:
+    """A compiled generative model whose observations are vectors of numbers; see the module's head for its functions."""
+
+    step: Callable[..., tuple[float, bool]]
+    likelihood: Callable[..., float]
+    actions: int
+    """A: actions are 0 .. A-1."""
+    state_size: int
+    """D: numbers in a state."""
+    observation_size: int = 1
+    """O: numbers in an observation."""
+    data: Any = ()
+    """Arrays and numbers handed to every function."""
+    rollout: Callable[..., float] | None = None
+    action_names: tuple[str, ...] = ()
+    """For people; empty means the numbers."""
+
+    def __post_init__(self) -> None:
+        check_actions(self.actions, self.action_names)
+        if self.state_size < 1 or self.observation_size < 1:
+            raise ValueError(
+                f"state_size is {self.state_size} and observation_size is {self.observation_size}, both must be >= 1"
+            )
+
+    @cached_property
+    def functions(self) -> tuple[Any, Any, Any]:
+        """step, likelihood and rollout compiled for this type of data (rollout may be None)."""
+        if getattr(numba.config, "DISABLE_JIT", 0):
+            return self.step, self.likelihood, self.rollout
+        data = typeof(self.data)
+        result = types.Tuple((types.float64, types.boolean))
+        step = callback(_plain(self.step), result(_STATE, types.int64, data, _RNG, _STATE))
+        likelihood = callback(_plain(self.likelihood), types.float64(_STATE, types.int64, _STATE, _STATE, data))
+        rollout = None
+        if self.rollout is not None:
+            signature = types.float64(_STATE, types.int64, _STATE, types.int64, types.int64, types.float64, data, _RNG)
+            rollout = callback(_plain(self.rollout), signature)
+        return step, likelihood, rollout
+
+
 class PythonModel(Protocol):
     """A generative model in plain Python. Slow: every step is interpreted, some thousand simulations a second at best.
 
     May also have ``rollout(state, action, observation, depth, max_depth, discount, rng) -> float``,
-    ``prior(state, action, observation, depth) -> (values [A], counts [A])``, ``upper(state, depth, max_depth, discount)`` and
-    ``action_names``, as in `CompiledModel`.
+    ``prior(state, action, observation, depth) -> (values [A], counts [A])``, ``upper(state, depth, max_depth, discount)``, for continuous
+    observations ``likelihood(state, action, state reached, observation) -> float``, and ``action_names``, as in `CompiledModel`.
     """
 
     actions: int
@@ -163,7 +213,7 @@ Sampler: TypeAlias = Callable[[int, np.random.Generator], ArrayLike]
 
 
 def belief_states(
-    model: CompiledModel, belief: Any, count: int, rng: np.random.Generator
+    model: CompiledModel | ContinuousModel, belief: Any, count: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
     """(states ``[P, D]``, weights ``[P]`` or None) of any kind of belief; a sampler is asked for `count` states."""
     weights = None
