@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -140,8 +141,7 @@ class TabField:
         """(``[n]`` automaton states with mass at this tick, ``[n, C]`` probability of each with each cell)."""
         if not 0 <= tick <= self.problem.horizon:
             raise ValueError(f"tick is {tick}, must lie in 0..{self.problem.horizon}, the field's horizon")
-        for moment in moments(self.bridge, tick, self._exactness):
-            pass
+        (moment,) = deque(moments(self.bridge, tick, self._exactness), maxlen=1)
         by_cell = moment.masses.reshape(len(moment.masses), self.bridge.cells, -1).sum(axis=2)
         return moment.automaton_states, by_cell
 
@@ -203,10 +203,10 @@ class TabField:
         happened = (tracking.decided[-1] == HAPPENED)[:, None] | tracking.happens[-1]
         given = self._lifted(self.problem, np.where(ending & ~happened, -np.inf, self.tilt.log_weight()))
         # P(s0) is bound no longer: starts from which the event is likelier gain.
-        gain = start_log_partition(given.bridge) - start_log_partition(self.bridge)
         used = given.bridge.start > 0
+        gain = start_log_partition(given.bridge)[used] - start_log_partition(self.bridge)[used]
         start = np.zeros(self.bridge.cells)
-        start[used] = self.bridge.start[used] * np.exp(gain[used])
+        start[used] = self.bridge.start[used] * np.exp(gain)
         return replace(given, bridge=given.bridge._replace(start=start / start.sum()))
 
     def condition(self, *observations: Observation, options: BeliefOptions | None = None) -> Posterior:
