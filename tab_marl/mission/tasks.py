@@ -245,11 +245,14 @@ class _Travel:
         return [self._walk(start, order) for order in orders]
 
     def _best_three(self, start: tuple[float, float], names: tuple[Place, ...], target: Place) -> tuple[Place, ...]:
+        cells = {place: int(self.grid.cells_of([self.scenario.place(place).centre])[0]) for place in (*names, target)}
+        home = int(self.grid.cells_of([start])[0])
+
         def length(order: tuple[Place, ...]) -> float:
-            cell, total = int(self.grid.cells_of([start])[0]), 0.0
+            cell, total = home, 0.0
             for place in order:
                 total += float(self.to((place,))[cell])
-                cell = int(self.grid.cells_of([self.scenario.place(place).centre])[0])
+                cell = cells[place]
             return total
 
         return min(((*three, target) for three in permutations(names, 3)), key=length)
