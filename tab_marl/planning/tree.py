@@ -40,6 +40,21 @@ EDGE = np.dtype(
 
 
 @dataclass(frozen=True, eq=False)
+class Readings:
+    """Observations that are vectors, by number: a float where they have one component, else a tuple."""
+
+    rows: NDArray[np.float64]
+    """``[numbers, O]``."""
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, number: int) -> float | tuple[float, ...]:
+        row = self.rows[number].tolist()
+        return float(row[0]) if len(row) == 1 else tuple(row)
+
+
+@dataclass(frozen=True, eq=False)
 class SearchTree:
     """What a search has learnt. Arrays may be shared with the search: treat them as read-only."""
 
@@ -49,8 +64,8 @@ class SearchTree:
     """``[edges]`` of dtype EDGE."""
     edge_actions: NDArray[np.int32]
     """``[edges]``."""
-    observations: tuple[object, ...] | None = None
-    """What observation number i was, where the model is plain Python (else observations are numbers already)."""
+    observations: tuple[object, ...] | Readings | None = None
+    """What observation number i was, where they are objects or vectors (else observations are numbers already)."""
     bounds: NDArray[np.float64] | None = None
     """``[nodes, 2]`` lower and upper bound of the return from each node on, where the search keeps bounds (DESPOT). There an
     edge's value is its lower bound, and visits count scenarios."""
