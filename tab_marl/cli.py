@@ -121,13 +121,29 @@ def field(
     mission: Annotated[str, typer.Argument(help='In English: "Reach Checkpoint A within 16s".')],
     scenario: Annotated[str, typer.Option(help="Name of a scenario.")] = "lab",
     preset: Annotated[str, typer.Option(help="default, or paper (the literal field).")] = "default",
-    out: Annotated[Path, typer.Option("--out", "-o", help="PNG of the occupancy over time.")] = Path("field.png"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="The picture: .png, .svg or .pdf.")] = Path("field.png"),
+    animation: Annotated[Path | None, typer.Option(help="Also a film of the occupancy: .gif or .mp4.")] = None,
+    answers: Annotated[Path | None, typer.Option(help="Also the numbers: .json (all) or .csv (by tick).")] = None,
+    save: Annotated[Path | None, typer.Option(help="Also the field itself: .npz, for tab_marl.TabField.load.")] = None,
+    completes: Annotated[float | None, typer.Option(help="Probability that the mission is completed.")] = None,
+    passes: Annotated[
+        list[str] | None, typer.Option(help='Soft constraint "PLACE=PROBABILITY"; may be repeated.')
+    ] = None,
+    start: Annotated[
+        str, typer.Option(help='scenario; nearer: moved if the mission is impossible from there; or metres "x,y".')
+    ] = "nearer",
 ) -> None:
     """Solve the TAB-Field of a mission, print what it says and draw it."""
-    from tab_marl.evaluation.single import solve_and_draw
+    from tab_marl.evaluation.field_command import FieldRequest, show_field
 
-    _announce_first_use()
-    print(solve_and_draw(mission, scenario, preset, out))
+    _announce_first_use("field")
+    print(
+        show_field(
+            FieldRequest(
+                mission, scenario, preset, out, animation, save, answers, completes, tuple(passes or ()), start
+            )
+        )
+    )
 
 
 @app.command()
@@ -202,10 +218,10 @@ def zoo_verify(
     raise typer.Exit(0 if verify_zoo(name, episodes) else 1)
 
 
-def _announce_first_use() -> None:
+def _announce_first_use(part: str = "planning") -> None:
     from tab_marl.evaluation.evaluate import FIRST_USE, first_use
 
-    if first_use():
+    if first_use(part):
         print(FIRST_USE, file=sys.stderr)
 
 

@@ -73,15 +73,15 @@ def play_missing(experiment: Experiment, store: Store, play: Play, console: Cons
         raise UserError(f"interrupted: {stored} of {settings.total} episodes are stored; to continue: {hint}") from None
 
 
-def first_use() -> bool:
-    """Whether no compiled kernel of this package lies in the usual cache yet."""
+def first_use(part: str = "planning") -> bool:
+    """Whether no compiled kernel of this part of the package lies in the usual cache yet."""
     import os
 
     import tab_marl
 
     if os.environ.get("NUMBA_CACHE_DIR"):
         return not any(Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*.nbi"))
-    return not any((Path(tab_marl.__file__).parent / "planning").rglob("*.nbi"))
+    return not any((Path(tab_marl.__file__).parent / part).rglob("*.nbi"))
 
 
 def _count_done(experiment: Experiment, store: Store) -> int:

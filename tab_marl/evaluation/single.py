@@ -1,4 +1,4 @@
-"""One thing at a time for the command line: a field, an episode, a training run, the zoo."""
+"""One thing at a time for the command line: an episode, a training run, the zoo."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ import numpy as np
 from rich.console import Console
 
 from tab_marl.evaluation.errors import UserError, require_known
-from tab_marl.world.scenario import Scenario
 
 FILM_STRIDE = 2
 """Every second control step becomes a frame."""
@@ -27,41 +26,6 @@ def _input() -> Iterator[None]:
         yield
     except ValueError as error:
         raise UserError(" ".join(str(error).split())) from error
-
-
-def solve_and_draw(mission: str, scenario: str, preset: str, out: Path) -> str:
-    """Solve the field of a mission in English, draw it to `out`, and say what it says."""
-    from tab_marl.field import FieldOptions, FieldProblem, solve
-    from tab_marl.mission import check_feasible, parse_mission, to_english
-
-    _writable(out)
-    with _input():
-        world = Scenario.preset(scenario)
-        parsed = parse_mission(mission, world)
-        options = FieldOptions.preset(preset)
-        check_feasible(parsed, world)
-        problem = FieldProblem.from_mission(parsed, world, options)
-        field = solve(problem)
-    done = field.completion_probability
-    step = world.step_seconds
-    reached = [int(np.argmax(done >= share - 1e-9)) * step for share in (0.1, 0.5, 0.9)]
-    size = f"{problem.reference.states} states x {len(problem.automaton.delta)} mission states"
-    chance = np.exp(field.log_partition)
-    lines = [
-        f"mission      {to_english(parsed, world)}",
-        f"scenario     {world.name}, {size}, {problem.horizon} ticks of {step:g} s",
-        f"log Z        {field.log_partition:.3f} (unguided motion completes it with probability {chance:.2g})",
-        f"completion   10 % by {reached[0]:g} s, half by {reached[1]:g} s, 90 % by {reached[2]:g} s",
-    ]
-    if len(field.branch_shares) > 1:
-        shares = ", ".join(f"{place} {100 * share:.0f} %" for place, share in field.branch_shares.items())
-        lines.append(f"goes to      {shares}")
-    import matplotlib
-
-    matplotlib.use("Agg")
-    field.plot(out)
-    lines.append(f"picture      {out}")
-    return "\n".join(lines)
 
 
 def watch_episode(
@@ -150,14 +114,3 @@ def train_policy(
             raise UserError(f"interrupted: the same command continues the run in {folder}") from None
     path = export_policy(model, settings, folder)
     console.print(f"policy: {path}; logs: tensorboard --logdir {folder}", highlight=False)
-
-
-def _writable(path: Path) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        existed = path.exists()
-        path.open("ab").close()
-        if not existed:
-            path.unlink()
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror}") from None
