@@ -74,6 +74,8 @@ class ProductChain(NamedTuple):
     """``[M]`` radians, nan for rest."""
     complete: NDArray[np.bool_]
     """``[Q]`` whether the mission is complete (in `accepting`, and where only other events are still watched)."""
+    span: int
+    """The largest difference between the numbers of two cells one tick apart."""
 
     @property
     def cells(self) -> int:
@@ -148,7 +150,8 @@ def product_chain(
     table = np.ones((count, states), dtype=np.float32) if value is None else np.ascontiguousarray(value)
     if table.dtype not in (np.float32, np.float64):
         table = table.astype(np.float64)
-    check_nonnegative("value (h)", table, (count, states))
+    if not harmonic:  # else it was computed from checked input, and may be large
+        check_nonnegative("value (h)", table, (count, states))
     tilt = np.ones((count, alphabet)) if weight is None else np.ascontiguousarray(weight, dtype=np.float64)
     check_nonnegative("weight", tilt, (count, alphabet))
     first = np.ascontiguousarray(start, dtype=np.float64)
@@ -190,6 +193,7 @@ def product_chain(
         float(cell_metres),
         reference.headings,
         np.arange(count) == automaton.accepting if complete is None else np.array(complete, dtype=np.bool_),
+        reference.span,
     )
 
 

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Compiled loops of the field: backward messages, pushing mass forward, reweighing it.
+"""Compiled loops of the field: expectations one tick ahead, pushing mass forward, reweighing it.
 
 Arrays and scalars only; nothing here validates or raises. Each has a slow twin in ``tests/field/test_kernels.py``.
 
@@ -20,14 +20,16 @@ from numba import njit
 
 
 @njit(cache=True)
-def expect_row(motion, r, ahead, out):
-    """``out[s] = sum_s' P(s'|s) ahead[s']`` under reference r."""
+def expect_cells(motion, r, needed, ahead, out):
+    """``out[s] = sum_s' P(s'|s) ahead[s']`` under reference r, for the states of the ``needed[C]`` cells."""
     modes = motion.mix.shape[1]
     states = out.shape[0]
     indices, data, width = motion.indices, motion.data, motion.width
     near = motion.near_share.shape[2]
     moved = np.empty(modes)
     for first in range(0, states, modes):
+        if not needed[first // modes]:
+            continue
         redrawn = 0.0
         row = r * states + first
         for m in range(modes):
@@ -64,13 +66,25 @@ def expect_row(motion, r, ahead, out):
 
 
 @njit(cache=True)
-def look_ahead(q, labels, delta, weight, value, log_scale, modes, ahead):
-    """Fill ``ahead[s'] = w(q, l') h[q', s'] / exp(base)``; return base (-inf if nothing lies ahead)."""
-    symbols = delta.shape[1]
+def expect_row(motion, r, ahead, out):
+    """`expect_cells` for all cells."""
+    expect_cells(motion, r, np.ones(out.shape[0] // motion.mix.shape[1], dtype=np.uint8), ahead, out)
+
+
+@njit(cache=True)
+def look_ahead_scale(q, delta, weight, log_scale):
+    """The largest scale among the states that may follow q; -inf if nothing lies ahead."""
     base = -math.inf
-    for symbol in range(symbols):
+    for symbol in range(delta.shape[1]):
         if weight[q, symbol] > 0.0:
             base = max(base, log_scale[delta[q, symbol]] + math.log(weight[q, symbol]))
+    return base
+
+
+@njit(cache=True)
+def look_ahead(q, labels, delta, weight, value, log_scale, modes, ahead):
+    """Fill ``ahead[s'] = w(q, l') h[q', s'] / exp(base)``; return base (-inf if nothing lies ahead)."""
+    base = look_ahead_scale(q, delta, weight, log_scale)
     if base == -math.inf:
         ahead[:] = 0.0
         return base
@@ -89,36 +103,6 @@ def look_ahead(q, labels, delta, weight, value, log_scale, modes, ahead):
             for s in range(first, first + modes):
                 ahead[s] = factor * value[following, s]
     return base
-
-
-@njit(cache=True)
-def backward(order, motion, reference_of, labels, delta, weight, peak, value, log_scale):
-    """Backward messages of the automaton states in `order` (falling rank), each row scaled to a maximum of `peak`.
-
-    Rows of `value` and `log_scale` for absorbing states are inputs, the others outputs (design, section 4).
-    """
-    modes = motion.mix.shape[1]
-    states = value.shape[1]
-    ahead = np.empty(states)
-    row = np.empty(states)
-    for q in order:
-        base = look_ahead(q, labels, delta, weight, value, log_scale, modes, ahead)
-        if base == -math.inf:
-            value[q, :] = 0.0
-            log_scale[q] = -math.inf
-            continue
-        expect_row(motion, reference_of[q], ahead, row)
-        largest = 0.0
-        for s in range(states):
-            largest = max(largest, row[s])
-        if largest == 0.0:
-            value[q, :] = 0.0
-            log_scale[q] = -math.inf
-            continue
-        factor = peak / largest
-        for s in range(states):
-            value[q, s] = row[s] * factor
-        log_scale[q] = base + math.log(largest / peak)
 
 
 @njit(cache=True)
@@ -172,6 +156,19 @@ def scatter_cell(motion, r, states, first, before, drawn, out):
 
 
 @njit(cache=True)
+def cells_with_mass(mass, modes):
+    """The first and one past the last cell that holds mass; (0, 0) if none does."""
+    first, last = 0, mass.shape[0]
+    while first < last and mass[first] <= 0.0:
+        first += 1
+    while last > first and mass[last - 1] <= 0.0:
+        last -= 1
+    if first == last:
+        return 0, 0
+    return first // modes, (last - 1) // modes + 1
+
+
+@njit(cache=True)
 def push(mass, q, free, chain, slot, rows, flux):
     """Move the mass ``[S]`` of automaton state q one tick on, adding it to ``rows[slot[q']]``; ``flux[l]`` counts it.
 
@@ -183,14 +180,20 @@ def push(mass, q, free, chain, slot, rows, flux):
     modes = motion.mix.shape[1]
     states = mass.shape[0]
     r = chain.reference_of[q]
+    first_cell, last_cell = cells_with_mass(mass, modes)
+    if last_cell == 0:
+        return
+    # What can be reached in one tick; nothing outside is looked at.
+    low, high = max(0, first_cell - chain.span), min(states // modes, last_cell + chain.span)
     # Sums of mass * P(s'|s), to be weighed by what lies ahead of s' (tilted) or not (plain).
-    tilted = np.zeros(states)
-    plain = np.zeros(states)
+    tilted, plain = np.empty(states), np.empty(states)
+    tilted[low * modes : high * modes] = 0.0
+    plain[low * modes : high * modes] = 0.0
     any_tilted, any_plain = False, False
     bridging = np.empty(modes)
     drifting = np.empty(modes)
     drawn = np.empty(modes)
-    for first in range(0, states, modes):
+    for first in range(first_cell * modes, last_cell * modes, modes):
         some_bridging, some_drifting = False, False
         for m in range(modes):
             bridging[m] = 0.0
@@ -217,7 +220,7 @@ def push(mass, q, free, chain, slot, rows, flux):
         if some_drifting:
             any_plain = True
             scatter_cell(motion, r, states, first, drifting, drawn, plain)
-    for cell in range(chain.labels.shape[0]):
+    for cell in range(low, high):
         symbol = chain.labels[cell]
         following = chain.delta[q, symbol]
         row = slot[following]
@@ -261,6 +264,64 @@ def forward(order, chain, slot, mass, flux):
     """
     for q in order:
         push(mass[q], q, False, chain, slot, mass, flux[q])
+
+
+@njit(cache=True)
+def rows_at_once(order, delta, started, transient):
+    """How many automaton states are begun and not yet done with, at most, when they are left in `order`."""
+    live = started.copy()
+    count = int(live.sum())
+    most = count
+    for q in order:
+        if live[q]:
+            for symbol in range(delta.shape[1]):
+                following = delta[q, symbol]
+                if transient[following] and not live[following]:
+                    live[following] = True
+                    count += 1
+            most = max(most, count)
+            count -= 1
+    return most
+
+
+@njit(cache=True)
+def forward_flux(order, chain, begun, masses, flux):
+    """``flux[q, l]``: how often each transition is taken, in expectation, by mass that starts as ``masses[n, S]``.
+
+    `order` is of rising rank and leaves out absorbing states; ``begun[n]`` are the automaton states of the masses. A row
+    of mass is kept only from the first visit to its automaton state until it has been left.
+    """
+    count = chain.delta.shape[0]
+    started, transient = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
+    for q in order:
+        transient[q] = True
+    for q in begun:
+        started[q] = transient[q]
+    capacity = rows_at_once(order, chain.delta, started, transient)
+    rows = np.zeros((capacity, masses.shape[1]))
+    vacant = np.arange(capacity)[::-1].copy()
+    vacancies = capacity
+    slot = np.full(count, -1)
+    for i in range(begun.shape[0]):
+        if transient[begun[i]]:
+            vacancies -= 1
+            slot[begun[i]] = vacant[vacancies]
+            rows[slot[begun[i]]] = masses[i]
+    for q in order:
+        here = slot[q]
+        if here < 0:
+            continue
+        for symbol in range(chain.delta.shape[1]):
+            following = chain.delta[q, symbol]
+            if transient[following] and slot[following] < 0:
+                vacancies -= 1
+                slot[following] = vacant[vacancies]
+        push(rows[here], q, False, chain, slot, rows, flux[q])
+        first, last = cells_with_mass(rows[here], chain.motion.mix.shape[1])
+        rows[here, first * chain.motion.mix.shape[1] : last * chain.motion.mix.shape[1]] = 0.0
+        slot[q] = -1
+        vacant[vacancies] = here
+        vacancies += 1
 
 
 @njit(cache=True)

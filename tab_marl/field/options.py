@@ -34,6 +34,9 @@ class FieldOptions:
     """Of the stored messages; the work is always done in double precision."""
     state_budget: int = 8_000_000
     """Automaton states x cells x modes up to which finer cells are preferred."""
+    only_reachable: bool | None = None
+    """Solve only where the adversary can be, given its start: the same law in less time and memory, but a belief that a
+    sighting contradicts finds less to fall back on. None: where the whole table would exceed `state_budget`."""
     memory_gigabytes: float = 4.0
     """`solve` refuses a problem that needs more (1 GB = 1e9 bytes)."""
     marginal_tolerance: float = 0.05

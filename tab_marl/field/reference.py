@@ -107,6 +107,13 @@ class Reference:
             kernels.expect_row(motion, r, np.ones(self.states), row)
         return motion
 
+    @cached_property
+    def span(self) -> int:
+        """The largest difference between the numbers of two cells one tick apart."""
+        cell = np.repeat(np.arange(self.count * self.states) % self.states // self.modes, np.diff(self.indptr))
+        away = np.abs(self.indices // self.modes - cell)[self.data > 0]
+        return int(away.max(initial=0))
+
     def mode_shares(self) -> NDArray[np.float64]:
         """``[M]``: the stationary distribution of the mode under reference 0."""
         modes = self.modes

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.field import kernels, tracking_kernels
+from tab_marl.field import backward_kernels, tracking_kernels
 from tab_marl.field.belief import ProductBelief
 from tab_marl.field.chain import ProductChain, product_chain
 from tab_marl.field.constraints import Tilt
@@ -16,7 +17,10 @@ from tab_marl.field.infeasible import InfeasibleField
 from tab_marl.field.problem import COMPLETE, UNDER_WAY, FieldProblem
 from tab_marl.field.sampling import Trajectories, sample_paths
 from tab_marl.field.sizing import refuse_beyond_memory
+from tab_marl.field.stencil import Stencil, no_stencil, stencil_of
+from tab_marl.field.support import Support, support_of
 from tab_marl.field.tab_field import TabField, expected_transitions, start_log_partition
+from tab_marl.field.tables import zeros
 
 Floats = NDArray[np.float64]
 
@@ -72,7 +76,8 @@ def _fitted(
     latest: list[ProductChain] = []
 
     def pass_both_ways(current: Tilt) -> Floats:
-        latest[:] = [message(problem, current)]
+        latest.clear()  # two tables at a time would take twice the memory
+        latest.append(message(problem, current))
         return expected_transitions(latest[0], problem.automaton.rank)
 
     def sample_visits() -> Floats:
@@ -93,16 +98,35 @@ def visits_of(paths: Trajectories, problem: FieldProblem, branches: int) -> Floa
     return np.stack([(branch == b).sum(axis=1) for b in range(branches)], axis=1).astype(np.float64)
 
 
+_layouts: WeakKeyDictionary[FieldProblem, dict[bool, tuple[Support, Stencil]]] = WeakKeyDictionary()
+
+
+def layout(problem: FieldProblem, failing: bool) -> tuple[Support, Stencil]:
+    """What all passes over a problem share; kept as long as the problem is."""
+    known = _layouts.setdefault(problem, {})
+    if failing not in known:
+        reachable = problem.options.only_reachable
+        if reachable is None:
+            entries = len(problem.automaton.delta) * problem.reference.states
+            reachable = entries > problem.options.state_budget
+        grid = problem.grid
+        stencil = no_stencil() if grid is None else stencil_of(problem.reference, grid.centres, grid.cell_metres)
+        known[failing] = support_of(problem, reachable, failing), stencil
+    return known[failing]
+
+
 def message(problem: FieldProblem, tilt: Tilt) -> ProductChain:
     """The chain of the backward messages under these weights."""
     automaton, motion = problem.automaton, problem.reference
     count, states = len(automaton.delta), motion.states
     single = problem.options.precision == "single"
-    value = np.empty((count, states), dtype=np.float32 if single else np.float64)
+    support, stencil = layout(problem, bool(np.isfinite(tilt.log_failure)))
+    value = zeros((count, states), np.float32 if single else np.float64)
     peak = PEAK[problem.options.precision]
     log_scale = np.zeros(count)
     value[automaton.accepting] = peak
-    value[automaton.rejecting] = peak if np.isfinite(tilt.log_failure) else 0.0
+    if np.isfinite(tilt.log_failure):
+        value[automaton.rejecting] = peak
     log_scale[automaton.rejecting] = tilt.log_failure
     weight = np.exp(tilt.log_weight())
     transient = np.setdiff1d(np.arange(count), [automaton.accepting, automaton.rejecting, automaton.initial])
@@ -116,12 +140,11 @@ def message(problem: FieldProblem, tilt: Tilt) -> ProductChain:
             peak, value, norm, log_scale,
         )  # fmt: skip
         order = order[~over]
-    kernels.backward(
-        order, motion.motion, problem.reference_of, problem.labels, automaton.delta, weight,
-        peak, value, log_scale,
+    backward_kernels.backward(
+        order, motion.motion, stencil, problem.reference_of, problem.labels, automaton.delta, weight,
+        peak, *support, value, log_scale,
     )  # fmt: skip
     # The initial state only reads the first label and is never left by a move; its scale is that of what follows.
-    value[automaton.initial] = 0.0
     first = automaton.delta[automaton.initial, np.unique(np.asarray(problem.labels)[np.asarray(problem.start) > 0])]
     log_scale[automaton.initial] = max(log_scale[first].max(), -1e300)
     grid = problem.grid

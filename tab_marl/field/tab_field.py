@@ -20,6 +20,7 @@ from tab_marl.field.paths import MostLikelyPath, most_likely_path, path_entropy
 from tab_marl.field.posterior import Posterior, posterior
 from tab_marl.field.sampling import Trajectories, sample_paths
 from tab_marl.field.sweep import Sweep, moments, sweep
+from tab_marl.field.tables import zeros
 from tab_marl.field.tracking import HAPPENED, track
 
 if TYPE_CHECKING:
@@ -276,21 +277,27 @@ def expected_transitions(chain: ProductChain, rank: NDArray[np.int32]) -> Floats
 
     `rank` ``[Q]`` rises along transitions between transient states, so each of them is visited at most once.
     """
-    return expected_visits(chain, rank)[1]
+    flux, belief, order = _forward_start(chain, rank)
+    kernels.forward_flux(order, chain, belief.automaton_states, belief.masses, flux)
+    return flux
 
 
 def expected_visits(chain: ProductChain, rank: NDArray[np.int32]) -> tuple[Table, Floats]:
     """(``[Q, S]`` probability of ever visiting each transient state, ``[Q, L]`` of ever taking each transition)."""
+    flux, belief, order = _forward_start(chain, rank)
+    mass = zeros(chain.value.shape, chain.value.dtype)
+    mass[belief.automaton_states] = belief.masses
+    slot = np.arange(len(chain.delta))
+    slot[[chain.accepting, chain.rejecting]] = -1
+    kernels.forward(order, chain, slot, mass, flux)
+    return mass, flux
+
+
+def _forward_start(chain: ProductChain, rank: NDArray[np.int32]) -> tuple[Floats, ProductBelief, NDArray[np.int32]]:
+    """The transitions read at tick 0, the law there, and the transient states by rising rank."""
     count, symbols = chain.delta.shape
     belief = ProductBelief(chain, EXACT)
-    mass = np.zeros(chain.value.shape, dtype=chain.value.dtype)
-    mass[belief.automaton_states] = belief.masses
     flux = np.zeros((count, symbols))
-    by_cell = belief.cell_marginal()
-    flux[chain.initial] = np.bincount(chain.labels, by_cell, minlength=symbols)
-    slot = np.arange(count)
-    absorbing = [chain.accepting, chain.rejecting]
-    slot[absorbing] = -1
+    flux[chain.initial] = np.bincount(chain.labels, belief.cell_marginal(), minlength=symbols)
     order = np.argsort(rank, kind="stable").astype(np.int32)
-    kernels.forward(order[~np.isin(order, [*absorbing, chain.initial])], chain, slot, mass, flux)
-    return mass, flux
+    return flux, belief, order[~np.isin(order, [chain.initial, chain.accepting, chain.rejecting])]

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tab_marl.field import from_matrices, kernels, product_chain, sampling_kernels
+from tab_marl.field import backward_kernels, from_matrices, kernels, product_chain, sampling_kernels
 from tab_marl.field.belief import ProductBelief
+from tab_marl.field.stencil import no_stencil
 
 
 class Small:
@@ -95,9 +96,11 @@ def test_backward_is_the_dense_recursion():
         log_scale = np.zeros(5)
         # Acyclic here: state 0 waits for nothing (its stay on symbol 0 leads to rejection instead).
         delta = np.array([[4, 1, 4], [4, 2, 3], [4, 4, 3], [3, 3, 3], [4, 4, 4]], dtype=np.int32)
-        kernels.backward(
-            np.array([2, 1, 0], dtype=np.int32), motion.motion, chain.reference_of, chain.labels, delta, weight, peak,
-            value, log_scale,
+        low, high = np.zeros((2, 9), dtype=np.int32), np.full((2, 9), 8, dtype=np.int32)
+        everywhere = np.ones((5, 9), dtype=np.uint8)
+        backward_kernels.backward(
+            np.array([2, 1, 0], dtype=np.int32), motion.motion, no_stencil(), chain.reference_of, chain.labels, delta,
+            weight, peak, everywhere, low, high, value, log_scale,
         )  # fmt: skip
         labels = np.repeat(chain.labels, chain.modes)
         h = np.zeros((5, chain.states))
