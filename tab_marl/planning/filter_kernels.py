@@ -47,3 +47,15 @@ def table_likelihood(before, action, state, observation, data):
         return 0.0
     below = data.observation[row, observation - 1] if observation > 0 else 0.0
     return data.observation[row, observation] - below
+
+
+def sparse_table_likelihood(before, action, state, observation, data):
+    """As `table_likelihood`, from sparse tables."""
+    rows = data.observation
+    row = action * data.terminal.shape[0] + np.int64(state[0])
+    below = 0.0
+    for entry in range(rows.first[row], rows.first[row + 1]):
+        if rows.number[entry] == observation:
+            return rows.cumulative[entry] - below
+        below = rows.cumulative[entry]
+    return 0.0

@@ -28,14 +28,15 @@ _STEPS = {NORTH: (0, 1), EAST: (1, 0), SOUTH: (0, -1), WEST: (-1, 0)}
 
 def robot_moves(places: Sequence[Place]) -> NDArray[np.int16]:
     """``[C * 5]``: the robot's cell after (cell, action); it stays where the way is blocked, and when it tags."""
-    after = [[_moved(places, c, a) if a != TAG else c for a in range(5)] for c in range(len(places))]
+    cell = {place: number for number, place in enumerate(places)}
+    after = [[_moved(cell, place, a) if a != TAG else cell[place] for a in range(5)] for place in places]
     return np.array(after, dtype=np.int16).ravel()
 
 
 def target_moves(places: Sequence[Place]) -> NDArray[np.int16]:
     """``[C * C * 5]``: the target's cell after (robot, target, slot), 5 equally likely slots."""
-    cells = range(len(places))
-    return np.array([_flights(places, r, t) for r in cells for t in cells], dtype=np.int16).ravel()
+    cell = {place: number for number, place in enumerate(places)}
+    return np.array([_flights(cell, r, t) for r in places for t in places], dtype=np.int16).ravel()
 
 
 def rollout_moves(places: Sequence[Place], stride: int) -> NDArray[np.int16]:
@@ -43,24 +44,43 @@ def rollout_moves(places: Sequence[Place], stride: int) -> NDArray[np.int16]:
 
     Free moves that do not double back; if there are none, the free moves (Silver and Veness's Tag).
     """
+    cell = {place: number for number, place in enumerate(places)}
     slots: list[int] = []
-    for cell in range(len(places)):
-        free = [(d, after) for d in _STEPS if (after := _moved(places, cell, d)) != cell] or [(NORTH, cell)]
+    for place in places:
+        moves = [(d, _moved(cell, place, d)) for d in _STEPS]
+        free = [move for move in moves if move[1] != cell[place]] or moves[:1]
         for last in range(5):
-            moves = [m for m in free if last == TAG or m[0] != (last + 2) % 4] or free
-            for action, after in moves:
-                slots += [action * stride + after] * (ROLLOUT_SLOTS // len(moves))
+            worth_trying = [m for m in free if last == TAG or m[0] != (last + 2) % 4] or free
+            for action, after in worth_trying:
+                slots += [action * stride + after] * (ROLLOUT_SLOTS // len(worth_trying))
     return np.array(slots, dtype=np.int16)
 
 
-def _moved(places: Sequence[Place], cell: int, direction: int) -> int:
-    (x, y), (dx, dy) = places[cell], _STEPS[direction]
-    return places.index((x + dx, y + dy)) if (x + dx, y + dy) in places else cell
+def seen_values(places: Sequence[Place], discount: float = 0.95) -> NDArray[np.float64]:
+    """``[C * C]``: the best return from (robot, target) if the target were always seen, by value iteration.
+
+    What the target hides can only cost: no policy can expect more.
+    """
+    cells = len(places)
+    robot = robot_moves(places).reshape(cells, 5).astype(int)
+    target = target_moves(places).reshape(cells, cells, TARGET_SLOTS).astype(int)
+    values = np.full((cells, cells), 10.0)
+    for _ in range(400):
+        after = np.stack([values[robot[:, a][:, None, None], target].mean(axis=2) for a in range(5)])
+        returns = np.array([-1.0] * 4 + [-10.0])[:, None, None] + discount * after
+        np.fill_diagonal(returns[TAG], 10.0)
+        values = returns.max(axis=0)
+    return np.ascontiguousarray(values.ravel())
 
 
-def _flights(places: Sequence[Place], robot: int, target: int) -> list[int]:
+def _moved(cell: dict[Place, int], place: Place, direction: int) -> int:
+    dx, dy = _STEPS[direction]
+    return cell.get((place[0] + dx, place[1] + dy), cell[place])
+
+
+def _flights(cell: dict[Place, int], robot: Place, target: Place) -> list[int]:
     """The target's next cells, equally likely: away along each axis with .4 (split where level), else it stays."""
-    (rx, ry), (tx, ty) = places[robot], places[target]
+    (rx, ry), (tx, ty) = robot, target
     x = [EAST, WEST] if tx == rx else [EAST if tx > rx else WEST] * 2
     y = [NORTH, SOUTH] if ty == ry else [NORTH if ty > ry else SOUTH] * 2
-    return [*(_moved(places, target, d) for d in x + y), target]
+    return [*(_moved(cell, target, d) for d in x + y), cell[target]]

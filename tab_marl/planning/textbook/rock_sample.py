@@ -61,10 +61,6 @@ class RockSampleData(NamedTuple):
     """Log odds below which `survey_rollout` gives a rock up."""
     trust: float
     """Log odds from which it goes without another check."""
-    discount: float
-    """With which the prior "informed" looks ahead."""
-    prior_count: int
-    """Simulations that its values count for."""
 
 
 def rock_sample_data(
@@ -113,8 +109,6 @@ def rock_sample_data(
         6.0,
         -0.1,
         1.5,
-        0.95,
-        3,
     )
 
 
@@ -122,24 +116,30 @@ def rock_sample(
     size: int = 7,
     rocks: int = 8,
     rollout: Literal["survey", "harvest", "legal", "engine"] = "survey",
-    prior: Literal["informed", "sensible", "none"] = "informed",
+    sensible: bool = True,
     data: RockSampleData | None = None,
 ) -> CompiledModel:
     """RockSample[size, rocks] as a compiled model of ``5 + rocks`` actions.
 
-    `rollout`: "harvest" collects the nearest rock that is more likely good than not, then the next, then leaves; "legal" is
-    uniform among actions that make sense; "engine" is uniform among all, with -100 at every border. `sensible` forbids, as a
-    prior, what cannot pay: walking into a border, sampling bare ground, checking a rock known beyond doubt.
+    `rollout`: "survey" goes to the nearest rock that may be good, checking it until sure, then to the next, and leaves; "harvest"
+    collects only what is more likely good than not, without a check; "legal" is uniform among actions that make sense; "engine"
+    is uniform among all, with -100 at every border. `sensible` forbids, as a prior, what cannot pay: walking into a border,
+    sampling bare ground, checking a rock known beyond doubt.
     """
     data = rock_sample_data(size, rocks) if data is None else data
-    function = {"survey": kernels.survey_rollout, "harvest": kernels.harvest_rollout, "legal": kernels.legal_rollout, "engine": None}[rollout]
+    function = {
+        "survey": kernels.survey_rollout,
+        "harvest": kernels.harvest_rollout,
+        "legal": kernels.legal_rollout,
+        "engine": None,
+    }[rollout]
     return CompiledModel(
         kernels.step,
         5 + data.rocks,
         2 + data.rocks,
         data,
         rollout=function,
-        prior={"informed": kernels.informed, "sensible": kernels.sensible, "none": None}[prior],
+        prior=kernels.sensible if sensible else None,
         action_names=("north", "east", "south", "west", "sample", *(f"check {k}" for k in range(data.rocks))),
     )
 

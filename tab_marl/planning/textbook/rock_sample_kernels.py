@@ -181,9 +181,8 @@ def legal_rollout(state, action, observation, depth, max_depth, discount, data, 
     return total
 
 
-@njit(cache=True)
-def forbid(state, data, counts):
-    """Sets the counts of actions that cannot pay to -1."""
+def sensible(state, action, observation, depth, data, values, counts):
+    """Forbids walking into the border, sampling where nothing is left, and checking rocks already known or collected."""
     cell = np.int64(state[0])
     for a in range(SAMPLE):
         if a != EAST and data.moves[cell * 4 + a] < 0:
@@ -194,73 +193,3 @@ def forbid(state, data, counts):
     for rock in range(data.rocks):
         if abs(state[FIRST + rock]) > data.sure:
             counts[CHECK + rock] = -1
-
-
-def sensible(state, action, observation, depth, data, values, counts):
-    """Forbids walking into the border, sampling where nothing is left, and checking rocks already known or collected."""
-    forbid(state, data, counts)
-
-
-@njit(cache=True)
-def expected_harvest(cell, state, data, changed, log_odds, discount):
-    """What `harvest_rollout` earns on average from `cell` by the rover's knowledge, with rock `changed`'s log odds replaced."""
-    taken = np.int64(0)
-    total = 0.0
-    weight = 1.0
-    while True:
-        nearest = -1
-        way = data.size * data.size
-        best = 0.0
-        for rock in range(data.rocks):
-            odds = log_odds if rock == changed else state[FIRST + rock]
-            if odds > 0.0 and not (taken >> rock) & 1:
-                distance = data.distance[cell * data.rocks + rock]
-                if distance < way:
-                    way = distance
-                    nearest = rock
-                    best = odds
-        if nearest < 0:
-            break
-        for _ in range(way):
-            weight *= discount
-        total += weight * 10.0 * (2.0 / (1.0 + np.exp(-best)) - 1.0)
-        weight *= discount
-        taken |= np.int64(1) << nearest
-        cell = data.rock_cell[nearest]
-    for _ in range(data.size - 1 - cell % data.size):
-        weight *= discount
-    return total + 10.0 * weight
-
-
-def informed(state, action, observation, depth, data, values, counts):
-    """`sensible`, and each remaining action starts as if tried: its reward and the expected harvest one step on."""
-    forbid(state, data, counts)
-    cell = np.int64(state[0])
-    discount = data.discount
-    for a in range(len(counts)):
-        if counts[a] < 0:
-            continue
-        counts[a] = data.prior_count
-        if a < SAMPLE:
-            after = np.int64(data.moves[cell * 4 + a])
-            if after < 0:
-                values[a] = 10.0
-            else:
-                values[a] = discount * expected_harvest(after, state, data, -1, 0.0, discount)
-        elif a == SAMPLE:
-            rock = np.int64(data.rock_at[cell])
-            good = 1.0 / (1.0 + np.exp(-state[FIRST + rock]))
-            values[a] = 10.0 * (2.0 * good - 1.0) + discount * expected_harvest(
-                cell, state, data, rock, COLLECTED, discount
-            )
-        else:
-            rock = a - CHECK
-            odds = state[FIRST + rock]
-            good = 1.0 / (1.0 + np.exp(-odds))
-            right = data.accuracy[cell * data.rocks + rock]
-            evidence = data.evidence[cell * data.rocks + rock]
-            seen_good = good * right + (1.0 - good) * (1.0 - right)
-            values[a] = discount * (
-                seen_good * expected_harvest(cell, state, data, rock, odds + evidence, discount)
-                + (1.0 - seen_good) * expected_harvest(cell, state, data, rock, odds - evidence, discount)
-            )
