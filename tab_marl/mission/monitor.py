@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -59,6 +59,14 @@ class Monitor:
         self._tick = -1
         self._done = 0
         self._why = ""
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "_inside_proposition"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Closures do not travel; they follow from the regions."""
+        self.__dict__.update(state)
+        self._inside_proposition = [_membership(region) for region in self.automaton.regions]
 
     @property
     def status(self) -> Status:

@@ -1,11 +1,10 @@
-"""PettingZoo's own tests on the environment, its registry, options, endings and errors."""
+"""The environment of one against one: its registry, options, endings and errors."""
 
 from __future__ import annotations
 
 import itertools
 import math
-import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -13,15 +12,7 @@ import numpy as np
 import pettingzoo
 import pytest
 from gymnasium.spaces import Discrete
-from pettingzoo.test import (
-    api_test,
-    max_cycles_test,
-    parallel_api_test,
-    parallel_seed_test,
-    render_test,
-    seed_test,
-)
-from pettingzoo.test.state_test import state_test
+from pettingzoo.test import api_test, max_cycles_test
 
 from tab_marl.envs import intercept_v0, register_all
 from tab_marl.envs.actions import nearest_discrete
@@ -37,41 +28,10 @@ FORWARD = np.array([1.0, 0.0], dtype=np.float32)
 STILL = np.array([-1.0, 0.0], dtype=np.float32)
 
 
-# PettingZoo's tests warn of what they do not like.
-pytestmark = pytest.mark.filterwarnings("error::UserWarning")
-
-
-@pytest.mark.parametrize("mission", ["M1", "M5"])
-def test_pettingzoo_parallel_api(mission: str) -> None:
-    parallel_api_test(intercept_v0.parallel_env(mission=mission), num_cycles=700)
-
-
-@pytest.mark.parametrize("make", [intercept_v0.env, intercept_v0.raw_env])
-def test_pettingzoo_aec_api(make: Callable[[], Any]) -> None:
-    """It may dislike that the two sides observe different things, and the adversary nothing once its mission is over."""
-    with warnings.catch_warnings(record=True) as found:
-        warnings.simplefilter("always")
-        api_test(make(), num_cycles=300)
-    unequal = {"Agents have different observation space sizes", "Observations are different shapes"}
-    said = {str(w.message) for w in found if w.category is UserWarning}
-    assert said - {"Observation numpy array is all zeros."} == unequal
-
-
-def test_pettingzoo_seeds() -> None:
-    seed_test(intercept_v0.env, num_cycles=300)
-    parallel_seed_test(intercept_v0.parallel_env, num_cycles=300)
-
-
-def test_pettingzoo_max_cycles() -> None:
+def test_the_module_is_what_pettingzoo_expects() -> None:
+    """The registered ids take the libraries' tests in test_conformance.py."""
     max_cycles_test(intercept_v0)
-
-
-def test_pettingzoo_render() -> None:
-    render_test(intercept_v0.env)
-
-
-def test_pettingzoo_state() -> None:
-    state_test(intercept_v0.env(), intercept_v0.parallel_env())
+    api_test(intercept_v0.raw_env(), num_cycles=20)
 
 
 def test_registry() -> None:
