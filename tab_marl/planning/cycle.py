@@ -9,7 +9,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tab_marl.planning.model import CompiledModel
+from tab_marl.planning.model import CompiledModel, ContinuousModel
 
 Belief = TypeVar("Belief")
 
@@ -40,7 +40,7 @@ class Game:
 
 
 def play(
-    model: CompiledModel,
+    model: CompiledModel | ContinuousModel,
     start: ArrayLike,
     belief: Belief,
     choose: Callable[[Belief, np.random.Generator], int],
@@ -61,7 +61,12 @@ def play(
     ended = False
     while not ended and len(actions) < max_steps:
         action = int(choose(belief, random))
-        observation, reward, ended = model.step(state, action, model.data, word)
+        observation: Any
+        if isinstance(model, ContinuousModel):
+            observation = np.empty(model.observation_size)
+            reward, ended = model.step(state, action, model.data, word, observation)
+        else:
+            observation, reward, ended = model.step(state, action, model.data, word)
         actions.append(action)
         observations.append(observation)
         rewards.append(float(reward))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numba
@@ -12,7 +13,14 @@ from numpy.typing import NDArray
 
 from tab_marl.planning import filter_kernels
 from tab_marl.planning.callbacks import callback
-from tab_marl.planning.model import CompiledModel, Particles, belief_states, check_weights, draw_particles
+from tab_marl.planning.model import (
+    CompiledModel,
+    ContinuousModel,
+    Particles,
+    belief_states,
+    check_weights,
+    draw_particles,
+)
 from tab_marl.planning.tables import SparseData, TableData
 
 _STATE = types.Array(types.float64, 1, "C")
@@ -44,6 +52,8 @@ def dynamics_of(model: Any, likelihood: Callable[..., float] | None) -> Particle
         elif given is None and isinstance(model.data, SparseData):
             given = filter_kernels.sparse_table_likelihood
         return CompiledDynamics(model, given)
+    if isinstance(model, ContinuousModel):
+        return ContinuousDynamics(model if likelihood is None else replace(model, likelihood=likelihood))
     return PythonDynamics(model, given)
 
 
@@ -72,6 +82,36 @@ class CompiledDynamics:
         filter_kernels.advance(
             self.model.functions[0], self._likelihood, self.model.data, states, int(action), int(observation), word,
             np.empty(self.model.state_size), after, weights,
+        )  # fmt: skip
+        return after, weights
+
+
+class ContinuousDynamics:
+    """Particles of a `ContinuousModel`: rows of an array, weighed by its likelihood."""
+
+    weighs = True
+
+    def __init__(self, model: ContinuousModel) -> None:
+        self.model = model
+
+    def draw(self, belief: Any, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+        states, weights = belief_states(self.model, belief, count, rng)
+        return states[draw_particles(count, len(states), weights, rng)]
+
+    def advance(
+        self, states: NDArray[np.float64], action: int, observation: Any, rng: np.random.Generator
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        seen = np.array(observation, dtype=np.float64).reshape(-1)
+        if seen.shape != (self.model.observation_size,):
+            raise ValueError(
+                f"observation has shape {seen.shape}, must be [{self.model.observation_size}] for this model"
+            )
+        word = rng.integers(2**64, size=1, dtype=np.uint64)
+        after, weights = np.empty_like(states), np.empty(len(states))
+        step, likelihood, _ = self.model.functions
+        filter_kernels.advance_seeing(
+            step, likelihood, self.model.data, states, int(action), seen, word, np.empty(self.model.state_size),
+            after, weights, np.empty_like(seen),
         )  # fmt: skip
         return after, weights
 

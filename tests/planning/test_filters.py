@@ -308,3 +308,24 @@ def test_sparse_tables_are_filtered_as_dense_ones():
             belief.update(action, observation)
     assert np.array_equal(particles[0].states, particles[1].states)
     assert particles[0].weights == pytest.approx(particles[1].weights, abs=1e-12)
+
+
+@heavy
+def test_particles_follow_continuous_readings_as_bayes_rule_on_the_whole_numbers_does():
+    model, rng = textbook.light_dark(), np.random.default_rng(0)
+    belief = ParticleFilter(model, textbook.light_dark_start, FilterOptions(40000), 1)
+    positions = np.arange(-60, 61)
+    exact = (abs(positions) <= 30) / 61
+    truth = -12
+    for action, move in [(3, 1), (4, 10), (3, 1), (0, -10)]:
+        truth += move
+        reading = rng.normal(truth, abs(truth - 10))
+        exact = np.interp(positions - move, positions, exact)
+        spread = abs(positions - 10) + 1e-4
+        exact *= np.exp(-0.5 * ((reading - positions) / spread) ** 2) / spread
+        exact /= exact.sum()
+        belief.update(action, reading)
+        counted = np.bincount(belief.states[:, 0].astype(int) + 60, weights=belief.weights, minlength=121)
+        assert np.abs(counted - exact).max() < 0.01
+    with pytest.raises(ValueError, match=r"observation has shape \(2,\), must be \[1\]"):
+        belief.update(3, [1.0, 2.0])

@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.planning.model import CompiledModel
+from tab_marl.planning.model import CompiledModel, ContinuousModel
 from tab_marl.planning.textbook import light_dark_kernels as kernels
 
 DECLARE = 2
@@ -69,6 +69,19 @@ def _full_view_values(radius: int, moves: NDArray[np.float64]) -> NDArray[np.flo
 def light_dark_start(count: int, rng: np.random.Generator, radius: int = 60) -> NDArray[np.float64]:
     """``[count, 1]`` states of the initial belief."""
     return rng.integers(-(radius // 2), radius // 2 + 1, size=(count, 1)).astype(np.float64)
+
+
+def light_dark(
+    rollout: Literal["full view", "random"] = "full view", data: LightDarkData | None = None
+) -> ContinuousModel:
+    """Light-dark with its continuous readings, for `Pomcpow` and particle filters.
+
+    `rollout`: "full view" is the best return if the position were known from now on, "random" walks at random.
+    """
+    function = {"full view": kernels.full_view_value, "random": kernels.random_walk}[rollout]
+    data = light_dark_data() if data is None else data
+    names = action_names(data.moves)
+    return ContinuousModel(kernels.step, kernels.likelihood, 5, 1, 1, data, rollout=function, action_names=names)
 
 
 def light_dark_binned(
