@@ -192,8 +192,9 @@ class FieldProblem:
         which = reference_of
         if isinstance(automaton, FiniteAutomaton):
             finite = automaton
-            cells = np.asarray(labels, dtype=np.int32)
-            automaton = finite.unrolled(horizon, cells, cells[np.asarray(start) > 0] if len(cells) else None)
+            cells, first = np.asarray(labels, dtype=np.int32), np.asarray(start, dtype=np.float64)
+            fits = cells.ndim == 1 and first.shape == cells.shape and (first > 0).any()  # else refused below
+            automaton = finite.unrolled(horizon, cells, cells[first > 0] if fits else None)
             which = None if which is None else finite.of_states(which, automaton.location, "reference_of")
         settings = {} if options is None else {"options": options}
         return cls(

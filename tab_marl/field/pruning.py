@@ -26,10 +26,12 @@ def pruned(problem: FieldProblem) -> FieldProblem:
         )
     neighbours = _neighbours(problem)
     visited = _visited(problem, neighbours)
-    kept = _completing(problem, neighbours, visited)
-    if not kept.any():
-        raise InfeasibleField("no feasible motion from any start cell completes the mission: there is nothing to keep")
+    hopeful = _completing(problem, neighbours, visited)
     automaton = problem.automaton
+    started = np.flatnonzero(np.asarray(problem.start) > 0)
+    if not hopeful[automaton.delta[automaton.initial, np.asarray(problem.labels)[started]], started].any():
+        raise InfeasibleField("no feasible motion from any start cell completes the mission: there is nothing to keep")
+    kept = hopeful.any(axis=1)
     kept[[automaton.initial, automaton.accepting, automaton.rejecting]] = True
     rough = None if problem.rough is None else pruned(problem.rough)
     return replace(
@@ -92,7 +94,7 @@ def _visited(problem: FieldProblem, neighbours: list[sparse.csr_array]) -> Bools
 
 
 def _completing(problem: FieldProblem, neighbours: list[sparse.csr_array], visited: Bools) -> Bools:
-    """``[Q]``: which states are visited in some cell from which the motion can still lead to acceptance."""
+    """``[Q, C]``: visited there, and from there the motion can still lead to acceptance."""
     automaton, labels = problem.automaton, np.asarray(problem.labels)
     which = np.asarray(problem.reference_of)
     hopeful = np.zeros_like(visited)
@@ -104,4 +106,4 @@ def _completing(problem: FieldProblem, neighbours: list[sparse.csr_array], visit
             continue
         ahead = hopeful[automaton.delta[q, labels], cells]
         hopeful[q] = visited[q] & ((neighbours[which[q]] @ ahead.astype(np.int32)) > 0)
-    return np.asarray(hopeful.any(axis=1))
+    return hopeful

@@ -190,7 +190,7 @@ class FiniteAutomaton:
             delta[rows] = number[self.table[source]]
             branch[rows] = np.where(delta[rows] == rejecting, NO_BRANCH, given[source])
         ticks = np.repeat(np.arange(horizon + 1), [len(layer) for layer in layers])
-        ticks = np.concatenate([[-1], ticks, [horizon + 1, horizon + 1]]).astype(np.int32)
+        ticks = np.concatenate([[-1], ticks, [horizon, horizon]]).astype(np.int32)
         location = np.concatenate([[self.initial], *layers, [COMPLETED, FAILED]]).astype(np.int32)
         clocks = np.zeros((rejecting + 1, 3), dtype=np.int32)
         clocks[:accepting] = ticks[:accepting, None]

@@ -45,6 +45,20 @@ class GridMap:
         radius = scenario.adversary.radius_metres if radius_metres is None else radius_metres
         return _grid_of(scenario, float(cell_metres), float(radius))
 
+    @classmethod
+    def from_array(cls, free: ArrayLike, cell_metres: float = 1.0) -> GridMap:
+        """From ``[rows, columns]`` booleans, row 0 at the bottom."""
+        where = np.asarray(free, dtype=bool)
+        if where.ndim != 2 or not where.any():
+            raise ValueError(f"free has shape {where.shape} with {where.sum()} free cells: must be 2-D with some")
+        if not cell_metres > 0:
+            raise ValueError(f"cell_metres is {cell_metres}, must be > 0")
+        row, column = (at.astype(np.int32) for at in np.nonzero(where))
+        cell_at = np.full(where.shape, BLOCKED, dtype=np.int32)
+        cell_at[where] = np.arange(len(row), dtype=np.int32)
+        centres = (np.stack([column, row], axis=1) + 0.5) * cell_metres
+        return cls(float(cell_metres), cell_at, centres, row, column)
+
     @property
     def cells(self) -> int:
         return len(self.centres)

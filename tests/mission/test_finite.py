@@ -159,7 +159,7 @@ def test_bad_calls() -> None:
     automaton = FiniteAutomaton([[0, 1], [1, 1]], 0, 1)
     with pytest.raises(ValueError, match="horizon_ticks is -1"):
         automaton.unrolled(-1)
-    with pytest.raises(ValueError, match="set of symbols in 0..1"):
+    with pytest.raises(ValueError, match=r"set of symbols in 0..1"):
         automaton.unrolled(3, labels=[2])
     with pytest.raises(ValueError, match=r"reference_of has shape \(3,\), must be \[2\]"):
         automaton.of_states([0, 0, 0], automaton.unrolled(2).location, "reference_of")
