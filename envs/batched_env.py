@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from tab_marl.envs.adversary_side import adversary_space, as_style
 from tab_marl.envs.batched_arenas import EVENTS, BatchedArenas, draw_bank
 from tab_marl.envs.ego_observation import ego_space
-from tab_marl.envs.opponents import HOLD_SECONDS, OPPONENTS, Player, follow_route, make_opponent
+from tab_marl.envs.opponents import HOLD_SECONDS, OPPONENTS, Opponent, Player, follow_route, make_opponent
 from tab_marl.envs.reward import AdversaryRewards
 from tab_marl.envs.styles import Style
-from tab_marl.envs.task_source import RANDOM, TaskSource, task_source
+from tab_marl.envs.task_source import TaskSource, task_source
 from tab_marl.mission import Mission
 from tab_marl.mission.tasks import Task
 from tab_marl.world.scenario import Scenario
@@ -54,11 +54,7 @@ class BatchedEnv(VectorEnv[Array, Array, NDArray[Any]]):
         self,
         num_envs: int,
         side: str,
-        opponent: str | Player | Callable[[Array], Any],
-        task: Task | TaskSource | None = None,
-        mission: str | Mission = "M1",
-        scenario: str | Scenario = "lab",
-        family: str = "point",
+        opponent: Opponent | Any,
         adversary_style: Style | str | None = None,
         end_on_completion: bool = True,
         full_observation: bool = False,
@@ -66,11 +62,17 @@ class BatchedEnv(VectorEnv[Array, Array, NDArray[Any]]):
         adversary_rewards: AdversaryRewards | None = None,
         tasks: int | None = None,
         render_mode: None = None,
+        task: Task | TaskSource | None = None,
+        mission: str | Mission = "M1",
+        scenario: str | Scenario = "lab",
+        **drawn: Any,
     ) -> None:
         """`side`: "ego" or "adversary", who learns. `opponent`: a scripted player's name (see `opponents`), or an object
         with ``act`` or a function that takes observations ``[N, D]`` and gives actions ``[N, 2]``, such as a zoo policy or
         a frozen copy of the learner. `tasks`: how many tasks are drawn once, at the first reset, and played over and over
-        (default: 64 where there is something to draw). The rest is `InterceptEnv`'s.
+        (default: 64 where there is something to draw). `task`, `mission`, `scenario` and what else says what is played (`family`,
+        `sampled`, `difficulty`, `curriculum`, `ego_task`, `adversary_sees_ego_metres`): see `task_source`. The rest is
+        `InterceptEnv`'s.
         """
         if side not in ("ego", "adversary"):
             raise ValueError(f"side is {side!r}, must be 'ego' or 'adversary'")
@@ -80,13 +82,13 @@ class BatchedEnv(VectorEnv[Array, Array, NDArray[Any]]):
         self.render_mode = render_mode
         other = "adversary" if side == "ego" else "ego"
         self._own_is_ego = side == "ego"
-        style = getattr(opponent, "style", None) if side == "ego" and adversary_style is None else adversary_style
-        self._style = as_style(style)
-        self._source = task_source(task, mission, scenario, family)
-        varied = callable(task) or scenario == RANDOM or self._style.varies
-        self._tasks = tasks if tasks is not None else TASKS if varied else 1
-        self._shape_of = self._source(np.random.default_rng(0)).scenario
         self._crowd = _crowd(opponent, other, num_envs)
+        own_style = getattr(self._crowd, "style", None) if side == "ego" else None
+        self._style = as_style(own_style if adversary_style is None else adversary_style)
+        self._source = task_source(task, mission, scenario, **drawn)
+        some, another = (self._source(np.random.default_rng(seed)) for seed in (0, 1))
+        self._tasks = tasks if tasks is not None else TASKS if some != another or self._style.varies else 1
+        self._shape_of = some.scenario
         self._options: dict[str, Any] = {
             "end_on_completion": end_on_completion,
             "full_observation": full_observation,
@@ -218,13 +220,14 @@ class _OnePerArena:
 class _Batch:
     """A policy or function that takes all observations at once."""
 
-    def __init__(self, function: Callable[[Array], Any], arenas: int) -> None:
-        self._function, self._arenas = function, arenas
+    def __init__(self, player: Player, arenas: int) -> None:
+        self._player, self._arenas = player, arenas
+        self.style = getattr(player, "style", None)
 
     def begin(self, which: NDArray[np.int64], tasks: Sequence[Task], rng: np.random.Generator) -> None: ...
 
     def act(self, observations: Array) -> Array:
-        actions = np.asarray(self._function(observations), dtype=np.float32)
+        actions = np.asarray(self._player.act(observations), dtype=np.float32)
         if actions.shape != (self._arenas, 2):
             raise ValueError(
                 f"the opponent answered observations {observations.shape} with actions {actions.shape}, must be "
@@ -233,19 +236,15 @@ class _Batch:
         return actions
 
 
-def _crowd(opponent: str | Player | Callable[[Array], Any], side: str, arenas: int) -> Crowd:
+def _crowd(opponent: Opponent | Any, side: str, arenas: int) -> Crowd:
     quick: dict[str, Callable[[int], Crowd]] = {"follow": _Follow, "random": _Random, "static": lambda n: _Static()}
     if isinstance(opponent, str):
         if opponent in OPPONENTS[side] and opponent in quick:
             return quick[opponent](arenas)
-        return _OnePerArena(opponent, side, arenas)
-    if isinstance(opponent, Player):
-        return _Batch(opponent.act, arenas)
-    if callable(opponent):
-        return _Batch(opponent, arenas)
-    raise TypeError(
-        f"opponent is {opponent!r}, must be one of {list(OPPONENTS[side])}, have act(observations), or be a function"
-    )
+        if opponent in OPPONENTS[side] or side == "ego":
+            return _OnePerArena(opponent, side, arenas)
+    # Policies, models and functions take all observations at once.
+    return _Batch(make_opponent(opponent, side), arenas)
 
 
 def batched_ego_env(num_envs: int = 1, opponent: Any = "follow", **arguments: Any) -> BatchedEnv:

@@ -94,7 +94,7 @@ def test_who_plays_the_other_side() -> None:
     """Scripted by name, all at once or one per arena; a zoo policy; a function of all observations."""
     policy = load_zoo()[0]
     paths = {}
-    for opponent in ("follow", "static", "random", policy, lambda o: np.zeros((len(o), 2))):
+    for opponent in ("follow", "static", "random", policy, policy.name, lambda o: np.zeros((len(o), 2))):
         env = gymnasium.make_vec("tab_marl/BatchedEgo-v0", num_envs=5, mission="M4", opponent=opponent)
         paths[str(opponent)] = play(env, 1, 40)
         moved = np.hypot(*(env.arenas.robots[:, 1, :2] - env.arenas.bank.tasks[0].scenario.adversary_start.centre).T)
@@ -106,7 +106,7 @@ def test_who_plays_the_other_side() -> None:
     with pytest.raises(ValueError, match=r"actions \(2,\), must be \(5, 2\): in a batched environment it plays all"):
         wrong.step(np.zeros((5, 2), dtype=np.float32))
     for bad, message in (
-        ({"opponent": 3}, "opponent is 3"),
+        ({"opponent": 3}, "opponent is 3, must be"),
         ({"tasks": 0}, "tasks is 0"),
         ({"side": "x"}, "side is 'x'"),
     ):
