@@ -136,25 +136,33 @@ def _with_start(world: Scenario, mission: Mission, start: str) -> tuple[Scenario
     except InfeasibleMission as impossible:
         if start != "nearer":
             raise
-        x, y = _nearer_start(world, mission, impossible)
-        radius = getattr(world.adversary_start, "radius", START_CELL_METRES)
+        radius = float(getattr(world.adversary_start, "radius", START_CELL_METRES))
+        x, y = _nearer_start(world, mission, radius, impossible)
         reason = str(impossible).removeprefix("the mission is impossible: ")
         note = f"moved to ({x:.2f}, {y:.2f}): {reason} (--start scenario refuses instead)"
         return replace(world, adversary_start=Disc(x, y, radius)), note
 
 
-def _nearer_start(world: Scenario, mission: Mission, impossible: InfeasibleMission) -> tuple[float, float]:
-    """The point nearest to the scenario's start, along free paths, from which the mission can be completed."""
+def _nearer_start(
+    world: Scenario, mission: Mission, radius: float, impossible: InfeasibleMission
+) -> tuple[float, float]:
+    """The centre nearest to the scenario's, along free paths, of a start disc that allows the mission all over."""
     grid = GridMap.from_scenario(world, START_CELL_METRES)
     away = grid.distances(grid.cells_of([world.adversary_start.centre]))
+    around = radius * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
     for cell in np.argsort(away, kind="stable"):
-        x, y = (float(part) for part in grid.centres[cell])
-        try:
-            check_feasible(mission, world, [x, y])
-            return x, y
-        except InfeasibleMission:
-            continue
+        centre = grid.centres[cell]
+        if all(_possible(world, mission, point) for point in centre + around):
+            return float(centre[0]), float(centre[1])
     raise impossible
+
+
+def _possible(world: Scenario, mission: Mission, point: np.ndarray) -> bool:
+    try:
+        check_feasible(mission, world, point)
+    except InfeasibleMission:
+        return False
+    return True
 
 
 def _words(field: TabField, mission: Mission, note: str | None) -> list[str]:
