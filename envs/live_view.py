@@ -10,6 +10,7 @@ from tab_marl.envs.mission_scene import MissionScene
 from tab_marl.envs.physics import ADVERSARY, EGO
 from tab_marl.envs.rendering import Frame, Other, Renderer, Window, lidar_ranges
 from tab_marl.envs.team_episode import TeamEpisode
+from tab_marl.mission import Mission, to_english
 from tab_marl.world.scenario import Scenario
 
 
@@ -21,6 +22,7 @@ class LiveView:
         self._show_lidar = show_lidar
         self._window: Window | None = None
         self._renderer: Renderer | None = None
+        self._english: dict[Mission, str] = {}
 
     def start(self, scenario: Scenario, scene: MissionScene | None) -> None:
         """A new episode begins."""
@@ -74,6 +76,8 @@ class LiveView:
             ego_trail=np.array(episode.paths[0]),
             adversary_trail=np.array(episode.paths[n]),
             seen_by=episode.seen[0],
+            also_lit=tuple(c for j, seen in enumerate(episode.seen) if j and episode.in_play[j] for c in seen),
+            also=tuple(self._line(episode, j) for j in range(1, len(episode.monitors))),
             last_seen=episode.sighted[0],
             status=monitor.status,
             why_failed=monitor.why_failed,
@@ -89,6 +93,13 @@ class LiveView:
             others=tuple(others),
             adversary_in_play=episode.in_play[0],
         )
+
+    def _line(self, episode: TeamEpisode, adversary: int) -> str:
+        """What an adversary beside the first one is about, and how far it is."""
+        task = episode.team.tasks[adversary]
+        text = self._english.setdefault(task.mission, to_english(task.mission, task.scenario))
+        state = "intercepted" if episode.captor[adversary] is not None else episode.monitors[adversary].status
+        return f"{text}: {'under way' if state == 'active' else state}"
 
     def array(self, frame: Frame) -> NDArray[np.uint8]:
         """The picture ``[height, width, 3]``."""

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 INSET = 24
 STATUS_COLOURS = {"active": d.INK, "completed": d.ADVERSARY, "failed": d.MUTED}
 RADII = {"interception": "interception radius", "avoidance": "encounter radius", "surveillance": "watching radius"}
+OTHERS_SHOWN = 3
+"""Missions of further adversaries in the panel."""
 MISSION_LINES = 7
 """Longer mission texts are cut."""
 
@@ -32,6 +34,8 @@ def draw_panel(
     y = INSET
     if scene is not None:
         y = _mission(picture, x, y, inner, scene, frame)
+    if frame.also:
+        y = _also(picture, x, y - 8, inner, frame.also)
     y = _clock(picture, x, y, inner, scenario, frame)
     _sensors(picture, x, y, inner, scenario, frame)
     _legend(picture, x, height - INSET, inner, scenario, scene, frame)
@@ -70,6 +74,19 @@ def _mission(picture: pygame.Surface, x: int, y: int, width: int, scene: Mission
         d.write(picture, line, (x + 12, y + 3), 13, colour, True)
         y += 18
     return y + 26
+
+
+def _also(picture: pygame.Surface, x: int, y: int, width: int, also: tuple[str, ...]) -> int:
+    y = _heading(picture, x, y, "other adversaries")
+    for text in also[:OTHERS_SHOWN]:
+        for line in d.wrapped(text, width, 12):
+            d.write(picture, line, (x, y), 12)
+            y += 17
+        y += 4
+    if len(also) > OTHERS_SHOWN:
+        d.write(picture, f"and {len(also) - OTHERS_SHOWN} more", (x, y), 12, d.MUTED)
+        y += 17
+    return y + 18
 
 
 def _tick_box(picture: pygame.Surface, x: int, y: int, done: bool, current: bool, failed: bool) -> None:
@@ -116,8 +133,8 @@ def _clock(picture: pygame.Surface, x: int, y: int, width: int, scenario: Scenar
 
 def _sensors(picture: pygame.Surface, x: int, y: int, width: int, scenario: Scenario, frame: Frame) -> int:
     y = _heading(picture, x, y, "what the ego sees")
-    if frame.seen_by:
-        names = ", ".join(scenario.checkpoints[i].name for i in frame.seen_by)
+    if frame.seen_by or frame.also_lit:
+        names = ", ".join(scenario.checkpoints[i].name for i in sorted({*frame.seen_by, *frame.also_lit}))
         text, colour = f"adversary at {names}", d.INK
         pygame.draw.rect(picture, d.LIT, (x, y + 2, 4, 14), border_radius=2)
     elif frame.watched:
@@ -132,8 +149,11 @@ def _sensors(picture: pygame.Surface, x: int, y: int, width: int, scenario: Scen
     for line in d.wrapped(text, width - 12, 13):
         d.write(picture, line, (x + 12, y), 13, colour)
         y += 19
+    bound = f"meet at {scenario.interception_metres:g} m"
+    if scenario.ego_task == "surveillance":
+        bound = f"sees up to {scenario.watch_metres:g} m"
     gap = math.hypot(frame.ego.x - frame.adversary.x, frame.ego.y - frame.adversary.y)
-    d.write(picture, f"robots {gap:.2f} m apart, meet at {scenario.interception_metres:g} m", (x + 12, y), 12, d.MUTED)
+    d.write(picture, f"robots {gap:.2f} m apart, {bound}", (x + 12, y), 12, d.MUTED)
     return y + 24
 
 

@@ -56,6 +56,10 @@ class Frame:
     adversary_trail: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 2)))
     seen_by: tuple[int, ...] = ()
     """Indices of the checkpoints whose cameras see the adversary."""
+    also_lit: tuple[int, ...] = ()
+    """Indices of the checkpoints whose cameras see another adversary."""
+    also: tuple[str, ...] = ()
+    """A line about each other adversary's mission."""
     last_seen: tuple[float, float, float] | None = None
     """x, y [m] and time [s] of the latest sighting."""
     status: str = "active"
@@ -176,7 +180,7 @@ class Renderer:
             self._draw_forbidden(region)
         for index, checkpoint in enumerate(scenario.checkpoints):
             at = (checkpoint.x, checkpoint.y, checkpoint.camera_metres)
-            if index in frame.seen_by:
+            if index in frame.seen_by or index in frame.also_lit:
                 canvas.disc(*at, d.LIT, 70)
                 canvas.ring(*at, d.LIT, 2.5)
             else:
@@ -232,9 +236,11 @@ class Renderer:
         canvas, scenario = self._canvas, self.scenario
         egos = [frame.ego, *(other.motion for other in frame.others if other.is_ego)]
         reach = scenario.watch_metres if scenario.ego_task == "surveillance" else scenario.interception_metres
+        canvas.surface.set_clip(canvas.inside())
         for ego in egos:
             canvas.disc(ego.x, ego.y, reach, d.LIT if frame.watched else d.EGO, 40 if frame.watched else 18)
             canvas.dashes(ego.x, ego.y, reach, d.EGO, 1.5, 170)
+        canvas.surface.set_clip(None)
         if frame.adversary_in_play:
             seen = bool(frame.seen_by) or frame.watched
             _draw_robot(canvas, frame.adversary, scenario.adversary.radius_metres, d.ADVERSARY, seen)
