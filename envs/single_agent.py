@@ -72,6 +72,7 @@ class SingleAgentEnv(gymnasium.Env[NDArray[np.float32], Any]):
             self.inner = TeamEnv(egos, adversaries, render_mode=render_mode, **arguments)
             ends = True
         self.inner.end_on_completion = ends if end_on_completion is None else end_on_completion
+        self.side = side
         self._own = f"{side}_0"
         mate = None
         if (egos if side == "ego" else adversaries) > 1:

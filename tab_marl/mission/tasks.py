@@ -84,7 +84,7 @@ def sample_task(
         map_drawn = sample_scenario(rng, options, name=f"{mission_id}-{family}") if scenario is None else scenario
         order, far = np.arange(len(map_drawn.checkpoints)), far_metres
         if scenario is not None:
-            order, far = _goal_order(rng, scenario, mission_id), far_metres * (1.0 - 0.8 * draw / MAPS)
+            order, far = _goal_order(rng, scenario, mission_id, family), far_metres * (1.0 - 0.8 * draw / MAPS)
         task = _attempt(rng, map_drawn, order, mission_id, family, drawn, far)
         if task is not None:
             return task
@@ -92,14 +92,23 @@ def sample_task(
     raise RuntimeError(f"no winnable {family} {mission_id} task with slack {slack} found on {where}")
 
 
-def _goal_order(rng: np.random.Generator, scenario: Scenario, mission_id: str) -> NDArray[np.int_]:
-    """Checkpoints of a given map in random order: the first are the goals. M4 keeps off those in the central zone."""
+def _goal_order(rng: np.random.Generator, scenario: Scenario, mission_id: str, family: str) -> NDArray[np.int_]:
+    """Checkpoints of a given map in random order: the first are the goals. M4 keeps off those in the central zone.
+
+    Raises ValueError if there are too few.
+    """
     order = rng.permutation(len(scenario.checkpoints))
     if mission_id == "M4":
         zone = scenario.region("central zone")
         centres = np.array([scenario.checkpoints[i].region.centre for i in order]).reshape(-1, 2)
         reach = np.array([scenario.checkpoints[i].radius_metres for i in order])
         order = order[zone.distance(centres) >= reach]
+    needed = 3 if mission_id == "M5" else 4 if family == "ambiguous" else 2 if mission_id == "M2" else 1
+    if len(order) < needed:
+        raise ValueError(
+            f"scenario {scenario.name!r} has {len(order)} checkpoints that can be goals of {family} {mission_id}, needs "
+            f"{needed}"
+        )
     return order
 
 
