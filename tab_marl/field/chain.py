@@ -171,7 +171,7 @@ def product_chain(
     else:
         norm = np.zeros_like(table)
         kernels.normalisers(transient, reference.motion, which, symbols, delta, tilt, table, scale, norm)
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
         factor = tilt * np.exp(scale[delta] - scale[:, None])
     factor[~np.isfinite(factor)] = 0.0
     return ProductChain(

@@ -1,7 +1,7 @@
 """What a field problem takes, before it starts: states, bytes by arithmetic, seconds at a rate measured on the problem.
 
 The rate is that of the problem's own reference: a few rows of messages are solved and timed, so that cells, moves,
-precision and machine are all in it.
+precision and machine are all in it. Where each automaton state can be is found first, and kept for the solver.
 """
 
 from __future__ import annotations
@@ -11,11 +11,15 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
+from tab_marl.field import kernels
 from tab_marl.field.options import FieldOptions
+from tab_marl.field.tables import LAZY_BYTES
 from tab_marl.mission.unroll import TickAutomaton
 
 if TYPE_CHECKING:
+    from tab_marl.field.constraints import Tilt
     from tab_marl.field.problem import FieldProblem
 
 GIGABYTE = 1e9
@@ -23,6 +27,9 @@ FEW_ROWS, MORE_ROWS = 2, 10
 """Automaton states solved for the rate: the difference is the cost of a state, the rest that of starting."""
 TIMED_AT_MOST, TIMING_SECONDS = 5, 0.2
 """Repetitions, and the time after which none is begun; the fastest counts."""
+PAGE_BYTES = 4096
+MOVE_BYTES, LEAST_MOVES = 12, 4
+"""Of an entry of a reference's sparse rows (index and probability), and entries of a row at least."""
 USUAL_ROUNDS = 4
 """Passes that weights beyond the mission usually take to fit (3 to 6 in the missions tried)."""
 
@@ -36,17 +43,19 @@ class Memory:
     """Bytes that solving holds at once."""
 
     messages: int
-    """Backward messages ``[Q, S]``."""
+    """Backward messages ``[Q, S]``; of a large table only the pages that are written."""
     masses: int
-    """Forward masses ``[Q, S]``, where weights are fitted."""
+    """Forward masses, where weights are fitted: of the automaton states that are under way at once."""
     reference: int
+    support: int
+    """Which cells each automaton state can be in ``[Q, C]``."""
     automaton: int
     scratch: int
-    """A few rows ``[S]``."""
+    """A few rows ``[S]``, or what finding the support takes before there are messages."""
 
     @property
     def total(self) -> int:
-        return self.messages + self.masses + self.reference + self.automaton + self.scratch
+        return self.messages + self.masses + self.reference + self.support + self.automaton + self.scratch
 
 
 @dataclass(frozen=True)
@@ -93,99 +102,151 @@ class FieldSize:
 def size_of(problem: FieldProblem) -> FieldSize:
     """See `FieldProblem.size`."""
     motion, automaton = problem.reference, problem.automaton
-    fitted = _is_fitted(problem)
-    passes = min(USUAL_ROUNDS, problem.options.max_iterations) if fitted else 1
+    tilt = _tilt_of(problem)
+    fitted = bool(problem.constraints) or tilt.needed
     return FieldSize(
         automaton_states=len(automaton.delta),
         cells=problem.cells,
         modes=motion.modes,
         moves=len(motion.data) // motion.count,
         ticks=int(automaton.rank.max()) - 1,
-        passes=passes,
-        memory=memory_of(problem, fitted),
+        passes=min(USUAL_ROUNDS, problem.options.max_iterations) if fitted else 1,
+        memory=memory_of(problem),
         seconds_per_pass=_seconds_of_pass(problem, fitted),
     )
 
 
-def memory_of(problem: FieldProblem, fitted: bool | None = None) -> Memory:
-    """Bytes that solving this problem holds at once."""
+def memory_of(problem: FieldProblem) -> Memory:
+    """Bytes that solving this problem holds at once. Finds the support, which solving then need not do again."""
+    from tab_marl.field.problem import UNDER_WAY
+    from tab_marl.field.solve import layout
+
+    tilt = _tilt_of(problem)
     motion, automaton = problem.reference, problem.automaton
-    rows = len(automaton.delta)
-    with_masses = _is_fitted(problem) if fitted is None else fitted
-    table = rows * motion.states * _message_bytes(problem.options)
+    possible = layout(problem, bool(np.isfinite(tilt.log_failure)))[0].possible
+    row = 8 * motion.states
+    messages = _table_bytes(possible, motion.modes * _message_bytes(problem.options))
+    if (np.asarray(problem.status) == UNDER_WAY).sum() < len(automaton.delta) - 2:  # watched beyond the mission's end
+        messages *= 2
     return Memory(
-        messages=table,
-        masses=table if with_masses else 0,
-        reference=motion.data.nbytes + motion.indices.nbytes + motion.indptr.nbytes + 8 * motion.count * motion.states,
+        messages=messages,
+        masses=_rows_at_once(problem) * row if problem.constraints or tilt.needed else 0,
+        reference=_reference_bytes(problem),
+        support=possible.nbytes + 8 * motion.count * problem.cells,
         automaton=sum(array.nbytes for array in vars(automaton).values() if isinstance(array, np.ndarray))
         + 3 * 8 * automaton.delta.size,
-        scratch=6 * 8 * motion.states,
+        scratch=6 * row,
     )
+
+
+def _tilt_of(problem: FieldProblem) -> Tilt:
+    from tab_marl.field.constraints import Tilt
+
+    return Tilt.of(problem)
 
 
 def _message_bytes(options: FieldOptions) -> int:
     return 4 if options.precision == "single" else 8
 
 
-def _is_fitted(problem: FieldProblem) -> bool:
-    from tab_marl.field.constraints import Tilt
+def _reference_bytes(problem: FieldProblem) -> int:
+    motion = problem.reference
+    return motion.data.nbytes + motion.indices.nbytes + motion.indptr.nbytes + 8 * motion.count * motion.states
 
-    return bool(problem.constraints) or Tilt.of(problem).needed
+
+def _table_bytes(possible: NDArray[np.uint8], cell_bytes: int) -> int:
+    """Of a table ``[Q, C]`` of cells of so many bytes: all, or from LAZY_BYTES on the pages with something possible."""
+    if possible.size * cell_bytes < LAZY_BYTES:
+        return possible.size * cell_bytes
+    at_once = max(1, PAGE_BYTES // cell_bytes)
+    begin = np.arange(0, possible.shape[1], at_once)
+    pages = np.add.reduceat(possible, begin, axis=1, dtype=np.int64) > 0
+    return int(pages.sum()) * max(PAGE_BYTES, cell_bytes)
+
+
+def _rows_at_once(problem: FieldProblem) -> int:
+    """Automaton states whose mass a forward pass holds at the same time."""
+    automaton = problem.automaton
+    order = np.argsort(automaton.rank, kind="stable").astype(np.int32)
+    order = order[~np.isin(order, [automaton.initial, automaton.accepting, automaton.rejecting])]
+    started, transient = np.zeros((2, len(automaton.delta)), dtype=np.bool_)
+    transient[order] = True
+    labels = np.asarray(problem.labels)[np.asarray(problem.start) > 0]
+    first = np.unique(automaton.delta[automaton.initial, labels])
+    started[first] = transient[first]
+    return int(kernels.rows_at_once(order, automaton.delta, started, transient))
 
 
 def refuse_beyond_memory(problem: FieldProblem) -> None:
     """Raise FieldTooLarge if solving would take more than `options.memory_gigabytes`."""
-    need = memory_of(problem)
-    allowed = problem.options.memory_gigabytes
-    if need.total <= allowed * GIGABYTE:
-        return
-    motion = problem.reference
-    raise FieldTooLarge(
-        f"solving needs {need.total / GIGABYTE:.3g} GB ({need.messages / GIGABYTE:.3g} messages = "
+    motion, options = problem.reference, problem.options
+    allowed = options.memory_gigabytes * GIGABYTE
+    size = (
         f"{len(problem.automaton.delta):,} automaton states x {motion.states // motion.modes:,} cells x "
-        f"{motion.modes} modes x {_message_bytes(problem.options)} bytes; {need.masses / GIGABYTE:.3g} forward masses; "
-        f"{need.reference / GIGABYTE:.3g} reference), more than FieldOptions.memory_gigabytes = {allowed:g}: use "
-        "larger cells, fewer headings, a shorter horizon, precision='single' or problem.pruned(), or raise the bound"
+        f"{motion.modes} modes"
     )
+    at_least = len(problem.automaton.delta) * problem.cells + _reference_bytes(problem)
+    if at_least > allowed:
+        raise FieldTooLarge(f"solving needs more than {at_least / GIGABYTE:.3g} GB ({size}), {_remedy(options)}")
+    need = memory_of(problem)
+    if need.total > allowed:
+        raise FieldTooLarge(
+            f"solving needs {need.total / GIGABYTE:.3g} GB ({size} x {_message_bytes(options)} bytes; "
+            f"{need.messages / GIGABYTE:.3g} messages, {need.masses / GIGABYTE:.3g} forward masses, "
+            f"{need.reference / GIGABYTE:.3g} reference, {need.support / GIGABYTE:.3g} support), {_remedy(options)}"
+        )
 
 
 def refuse_before_building(automaton: TickAutomaton, cells: int, modes: int, options: FieldOptions) -> None:
-    """The same from the messages alone, before a reference is built. Raises FieldTooLarge."""
-    need = len(automaton.delta) * cells * modes * _message_bytes(options)
-    if need > options.memory_gigabytes * GIGABYTE:
+    """The same from what is the least, before a reference is built. Raises FieldTooLarge."""
+    entries = len(automaton.delta) * cells * modes
+    whole = options.only_reachable is False or (options.only_reachable is None and entries <= options.state_budget)
+    least = entries * _message_bytes(options) if whole else len(automaton.delta) * cells
+    least += cells * modes * LEAST_MOVES * MOVE_BYTES
+    if least > options.memory_gigabytes * GIGABYTE:
         raise FieldTooLarge(
-            f"the messages alone would take {need / GIGABYTE:.3g} GB ({len(automaton.delta):,} automaton states x "
-            f"{cells:,} cells x {modes} modes x {_message_bytes(options)} bytes), more than "
-            f"FieldOptions.memory_gigabytes = {options.memory_gigabytes:g}: use larger cells (cell_metres), fewer "
-            "headings, a shorter horizon or precision='single', or raise the bound"
+            f"solving needs more than {least / GIGABYTE:.3g} GB ({len(automaton.delta):,} automaton states x "
+            f"{cells:,} cells x {modes} modes), {_remedy(options)}"
         )
+
+
+def _remedy(options: FieldOptions) -> str:
+    return (
+        f"above FieldOptions.memory_gigabytes = {options.memory_gigabytes:g}: use larger cells, fewer headings, a shorter "
+        "horizon, precision='single', only_reachable=True or problem.pruned(), or raise the bound"
+    )
 
 
 def _seconds_of_pass(problem: FieldProblem, fitted: bool) -> float:
     """Chains of few and of more states on this problem's reference, solved and timed: a cost per state and one apart."""
-    few, more = FEW_ROWS, MORE_ROWS
-    _timed(problem, few, fitted)  # loads the compiled code
+    from tab_marl.field.solve import layout
+
+    small = [_counting(problem, rows) for rows in (FEW_ROWS, MORE_ROWS)]
+    for one in small:  # loads the compiled code, and prepares what all passes share
+        _timed(one, fitted)
     began = time.perf_counter()
-    samples = []
+    samples: list[list[float]] = []
     while len(samples) < TIMED_AT_MOST and (not samples or time.perf_counter() - began < TIMING_SECONDS):
-        samples.append((_timed(problem, few, fitted), _timed(problem, more, fitted)))
+        samples.append([_timed(one, fitted) for one in small])
     at_few, at_more = np.min(samples, axis=0)  # the machine's other work only adds
-    per_row = max(at_more - at_few, 0.0) / (more - few)
-    # Neither the initial state nor the absorbing ones are solved for.
-    return float(at_few + per_row * max(0, len(problem.automaton.delta) - 3 - few))
+    per_row = max(at_more - at_few, 0.0) / (MORE_ROWS - FEW_ROWS)
+    # Rows are solved for where they can matter: that many whole rows, without the initial and the absorbing ones.
+    possible = layout(problem, bool(np.isfinite(_tilt_of(problem).log_failure)))[0].possible
+    automaton = problem.automaton
+    ended = [automaton.initial, automaton.accepting, automaton.rejecting]
+    rows = float(np.delete(possible, ended, axis=0).sum(dtype=np.int64)) / problem.cells
+    return float(max(0.0, at_few - FEW_ROWS * per_row) + per_row * rows)
 
 
-def _timed(problem: FieldProblem, rows: int, fitted: bool) -> float:
+def _timed(problem: FieldProblem, fitted: bool) -> float:
     from tab_marl.field.constraints import Tilt
     from tab_marl.field.solve import message
     from tab_marl.field.tab_field import expected_transitions
 
-    small = _counting(problem, rows)
-    tilt = Tilt.of(small)
     began = time.perf_counter()
-    chain = message(small, tilt)
+    chain = message(problem, Tilt.of(problem))
     if fitted:
-        expected_transitions(chain, small.automaton.rank)
+        expected_transitions(chain, problem.automaton.rank)
     return time.perf_counter() - began
 
 
@@ -210,7 +271,9 @@ def _counting(problem: FieldProblem, rows: int) -> FieldProblem:
         speed_limit=np.full(count + 2, np.inf),
         clocks=np.zeros((count + 2, 3), dtype=np.int32),
     )
-    options = replace(problem.options, goal_marginals=False, timing_prior=False, completion_probability=1.0)
+    options = replace(
+        problem.options, goal_marginals=False, timing_prior=False, completion_probability=1.0, only_reachable=False
+    )
     return replace(
         problem, automaton=automaton, options=options, reference_of=None, stage=None, stage_names=("mission",),
         status=None, mission=None, constraints=(), tracking=None, rough=None,
