@@ -43,7 +43,7 @@ class FieldRequest:
     """Probability of completing the mission; None: it is completed."""
     passes: tuple[str, ...] = ()
     """Each "PLACE=PROBABILITY"."""
-    start: str = "scenario"
+    start: str = "nearer"
     """`scenario`, `nearer` (moved only if the mission is impossible from there) or "x,y" in metres."""
 
 

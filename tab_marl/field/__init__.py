@@ -4,7 +4,10 @@ from tab_marl.field.belief import BeliefOptions, ProductBelief
 from tab_marl.field.chain import ProductChain, product_chain
 from tab_marl.field.contradiction import ContradictoryConstraints
 from tab_marl.field.events import Completes, IsAt, Passes, SoftConstraint, TimingPrior, Tracker
+from tab_marl.field.evidence import ImpossibleEvidence, Likelihood, NearZeroEvidence, Observation, Seen, Unseen
 from tab_marl.field.infeasible import InfeasibleField
+from tab_marl.field.paths import MostLikelyPath
+from tab_marl.field.posterior import Posterior
 from tab_marl.field.problem import FieldOptions, FieldProblem
 from tab_marl.field.processes import (
     paper_walk,
@@ -31,17 +34,25 @@ __all__ = [
     "FieldSize",
     "FieldTooLarge",
     "FitReport",
+    "ImpossibleEvidence",
     "InfeasibleField",
     "IsAt",
+    "Likelihood",
+    "MostLikelyPath",
+    "NearZeroEvidence",
+    "Observation",
     "Passes",
+    "Posterior",
     "ProductBelief",
     "ProductChain",
     "Reference",
+    "Seen",
     "SoftConstraint",
     "TabField",
     "TimingPrior",
     "Tracker",
     "Trajectories",
+    "Unseen",
     "from_matrices",
     "paper_walk",
     "product_chain",

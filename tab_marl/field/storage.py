@@ -33,6 +33,7 @@ from tab_marl.world.voxels import VoxelMap
 FORMAT, VERSION = "tab_marl.field", 1
 MOST_BYTES = 8_000_000_000
 """Of a file's arrays once unpacked: beyond it the file is refused before anything is allocated."""
+MOST_BRANCHES = 10_000
 GRIDS: dict[str, type[GridMap | VoxelMap]] = {"GridMap": GridMap, "VoxelMap": VoxelMap}
 WORLDS: dict[str, type[Scenario | Volume]] = {"Scenario": Scenario, "Volume": Volume}
 REFERENCE = ("indptr", "indices", "data", "mix", "headings", "jump", "redraw")
@@ -260,7 +261,7 @@ def _automaton(header: dict[str, Any], arrays: dict[str, NDArray[Any]], tracked:
         name: _array(arrays, f"automaton.{name}", "f" if name == "speed_limit" else "i", shapes.get(name, (count,)))
         for name in AUTOMATON
     }
-    _within("automaton.branch", parts["branch"], -1, max(len(header["branch_places"]), 1) - 1)
+    _within("automaton.branch", parts["branch"], -1, len(header["branch_places"] or range(MOST_BRANCHES)) - 1)
     return (TrackedAutomaton if tracked else TickAutomaton)(
         initial=initial, accepting=accepting, rejecting=rejecting, sides=tuple(header["sides"]), **parts
     )
