@@ -12,13 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tab_marl.envs.episode import CLOSING_MARGIN, START_DRAWS, START_ROUNDS
+from tab_marl.envs.episode import CLOSING_MARGIN, START_DRAWS
 from tab_marl.envs.physics import Arena, Motion, Start
 from tab_marl.mission.monitor import Monitor
 from tab_marl.mission.teams import TeamTask
 from tab_marl.world.grid import free_points
 from tab_marl.world.regions import BOUNDARY_METRES, Region, sample_in
 from tab_marl.world.scenario import Scenario
+
+ROUNDS = 500
+"""Draws of all starts together before it is given up."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +161,7 @@ def draw_team_starts(team: TeamTask, rng: np.random.Generator) -> tuple[list[Sta
     regions = [(region, scenario.ego.radius_metres) for region in team.ego_starts]
     regions += [(task.scenario.adversary_start, scenario.adversary.radius_metres) for task in team.tasks]
     egos = len(team.ego_starts)
-    for _ in range(START_ROUNDS * START_DRAWS):
+    for _ in range(ROUNDS):
         starts = [_draw(scenario, region, radius, rng) for region, radius in regions]
         if all(
             math.dist(starts[i][:2], starts[j][:2])
