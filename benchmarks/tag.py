@@ -119,6 +119,28 @@ def rate(model: Any, options: PomcpOptions, beliefs: list[TagBelief], repeats: i
     return Rate(simulations / seconds, steps / seconds)
 
 
+def peer_rows(uniform: Rate, history: Rate, beliefs: list[TagBelief]) -> None:
+    """pomdp-py in the same run: POUCT, 1,000 simulations, 90 steps deep, uniform rollouts, the same beliefs and CPU clock."""
+    try:
+        from pomdp_py_tag import Peer, ShippedPeer
+    except ImportError:
+        print("  pomdp-py is not installed: pip install 'tab-marl[benchmarks]'")
+        return
+    for name, make in (("its own Tag", ShippedPeer), ("Tag rewritten for it", Peer)):
+        peer = make(1000, exploration=10.0, discount=DISCOUNT, max_depth=90, seed=0)
+        rng = np.random.default_rng(0)
+        started = time.process_time()
+        for belief in beliefs:
+            peer.plan(belief, rng)
+        seconds = time.process_time() - started
+        simulations, steps = 1000 * len(beliefs) / seconds, peer.transition.calls / seconds
+        print(f"  {'pomdp-py, ' + name + ', uniform rollout':<42}{simulations / 1e3:>10,.2f}{steps / 1e6:>11,.3f}")
+        print(
+            f"    we do {uniform.simulations / simulations:,.0f} times the simulations and {uniform.steps / steps:,.0f} times the "
+            f"steps (history-aware: {history.simulations / simulations:,.0f} and {history.steps / steps:,.0f})"
+        )
+
+
 def returns(model: CompiledModel, options: PomcpOptions, games: int) -> NDArray[np.float64]:
     planner = Pomcp(model, options)
 
@@ -128,7 +150,7 @@ def returns(model: CompiledModel, options: PomcpOptions, games: int) -> NDArray[
     return np.array([play_tag(move, np.random.default_rng(seed), model.data, DISCOUNT) for seed in range(games)])
 
 
-def speed_table(repeats: int) -> None:
+def speed_table(repeats: int, peer: bool) -> None:
     beliefs = situations(200, seed=1)[::4]
     options = PomcpOptions(simulations=1000, exploration=10.0, discount=DISCOUNT)
     print(f"{'speed at 1,000 simulations a move':<44}{'k sims/s':>10}{'M steps/s':>11}")
@@ -141,6 +163,8 @@ def speed_table(repeats: int) -> None:
     for name, model in rows:
         measured[name] = rate(model, options, beliefs, repeats)
         print(f"  {name:<42}{measured[name].simulations / 1e3:>10,.0f}{measured[name].steps / 1e6:>11,.1f}", flush=True)
+    if peer:
+        peer_rows(measured["uniform rollout"], measured["history-aware rollout"], beliefs[:5])
     plain = rate(PlainTag(), options, beliefs[:5], 2)
     print(f"  {'plain Python, history-aware rollout':<42}{plain.simulations / 1e3:>10,.1f}{plain.steps / 1e6:>11,.2f}")
     fast = measured["history-aware rollout"]
@@ -174,11 +198,12 @@ def main() -> int:
     parser.add_argument("--games", type=int, default=100, help="games a row (0: speed only)")
     parser.add_argument("--large", action="store_true", help="also 10,000 simulations a move")
     parser.add_argument("--repeats", type=int, default=20, help="timings of each plan, of which the quickest counts")
+    parser.add_argument("--without-peer", action="store_true", help="do not run pomdp-py")
     arguments = parser.parse_args()
     if arguments.repeats < 1 or arguments.games < 0 or arguments.games == 1:
         parser.error("--repeats must be >= 1 and --games 0 or >= 2")
     print(f"Python {platform.python_version()}, numba {numba.__version__}, {platform.machine()}, one thread\n")
-    speed_table(arguments.repeats)
+    speed_table(arguments.repeats, not arguments.without_peer)
     if arguments.games:
         return_table(arguments.games, arguments.large)
     return 0
