@@ -136,7 +136,7 @@ def _facts(environment: Environment, env: Any) -> str:
         ("state shape", f"{env.state_space.shape}"),
         ("seeds", "`reset(seed=...)`; same seed, options and actions: same episode"),
     ]
-    return _table(("", ""), rows)
+    return _table(("what", "here"), rows)
 
 
 def _actions(env: Any) -> str:
