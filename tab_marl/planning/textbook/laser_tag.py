@@ -105,7 +105,15 @@ def laser_tag(
     """
     data = laser_tag_data(laser_tag_places(seed)) if data is None else data
     function = {"history": kernels.history_rollout, "seen": kernels.seen_leaf, "engine": None}[rollout]
-    return CompiledModel(kernels.step, 5, 2, data, rollout=function, action_names=chase_maps.ACTION_NAMES)
+    return CompiledModel(
+        kernels.step,
+        5,
+        2,
+        data,
+        rollout=function,
+        action_names=chase_maps.ACTION_NAMES,
+        upper=kernels.seen_value,
+    )
 
 
 class LaserTagBelief:

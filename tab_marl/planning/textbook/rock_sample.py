@@ -141,6 +141,7 @@ def rock_sample(
         rollout=function,
         prior=kernels.sensible if sensible else None,
         action_names=("north", "east", "south", "west", "sample", *(f"check {k}" for k in range(data.rocks))),
+        upper=kernels.upper,
     )
 
 
