@@ -47,22 +47,29 @@ SAMPLES = 2000
 """Of models that can only sample."""
 PACES = (0.55, 0.75, 1.0)
 
-DEFAULT = FieldOptions()
-FIELDS: dict[str, FieldOptions] = {
-    "literal (paper_walk)": FieldOptions(reference="paper_walk", goal_marginals=False),
-    "walk": FieldOptions(reference="walk", goal_marginals=False),
-    "walk + goals": FieldOptions(reference="walk"),
-    "walk + timing": FieldOptions(reference="walk", goal_marginals=False, timing_prior=True),
-    "walk + goals + timing": FieldOptions(reference="walk", timing_prior=True),
-    "tumble 0.5 m": FieldOptions(mean_run_metres=0.5, goal_marginals=False),
-    "tumble 1 m": FieldOptions(mean_run_metres=1.0, goal_marginals=False),
-    "tumble 2 m": FieldOptions(mean_run_metres=2.0, goal_marginals=False),
-    "tumble 1 m + timing": FieldOptions(goal_marginals=False, timing_prior=True),
-    "tumble 0.5 m + goals": FieldOptions(mean_run_metres=0.5),
-    "tumble 1 m + goals": FieldOptions(mean_run_metres=1.0),
-    "tumble 2 m + goals": FieldOptions(mean_run_metres=2.0),
-    "tumble 1 m + goals + timing": FieldOptions(timing_prior=True),
-}
+DEFAULT = FieldOptions(reference="drive_and_turn")
+
+
+def _fields() -> Iterator[tuple[str, FieldOptions]]:
+    plain = {"goal_marginals": False}
+    both = {"goal_marginals": True, "timing_prior": True}
+    yield "paper walk", FieldOptions(reference="paper_walk", **plain)
+    for name, motion in {
+        "walk": FieldOptions(reference="walk"),
+        "tumble": FieldOptions(reference="run_and_tumble"),
+        "drive": FieldOptions(reference="drive_and_turn"),
+    }.items():
+        yield name, replace(motion, **plain)
+        yield f"{name} + goals", motion
+        yield f"{name} + timing", replace(motion, goal_marginals=False, timing_prior=True)
+        yield f"{name} + goals + timing", replace(motion, **both)
+    yield "unicycle + goals", FieldOptions(reference="unicycle")
+    yield "tumble 0.5 m + goals", FieldOptions(reference="run_and_tumble", mean_run_metres=0.5)
+    yield "drive 0.5 m + goals", replace(DEFAULT, mean_run_metres=0.5)
+    yield "drive 2 m + goals", replace(DEFAULT, mean_run_metres=2.0)
+
+
+FIELDS = dict(_fields())
 """Literal maximum entropy and each repair, alone and together."""
 OTHERS = ("particles", "marginal kernel", "pace latent", "S", "FP", "MLE", "knows the population")
 """Of the default field: filtered by 2,000 particles, moved by its marginals as in the paper, a mixture over paces fixed per

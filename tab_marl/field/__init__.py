@@ -10,6 +10,7 @@ from tab_marl.field.paths import MostLikelyPath
 from tab_marl.field.posterior import Posterior
 from tab_marl.field.problem import FieldOptions, FieldProblem
 from tab_marl.field.processes import (
+    drive_and_turn,
     paper_walk,
     reference_from_simulator,
     reference_from_trajectories,
@@ -53,6 +54,7 @@ __all__ = [
     "Tracker",
     "Trajectories",
     "Unseen",
+    "drive_and_turn",
     "from_matrices",
     "paper_walk",
     "product_chain",

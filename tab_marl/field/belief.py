@@ -89,12 +89,12 @@ class ProductBelief:
             h = chain.value[q].reshape(chain.cells, chain.modes)[here].astype(np.float64)
             if q == chain.accepting:
                 h = np.ones_like(h)
-            share = chain.mode_shares * h * (chain.factor[chain.initial, chain.labels[here]] > 0)[:, None]
+            share = chain.first_mode_shares * h * (chain.factor[chain.initial, chain.labels[here]] > 0)[:, None]
             norm = share.sum(axis=1, keepdims=True)
             tilted[here] = np.where(norm > 0, share / np.maximum(norm, 1e-300), 0.0)
         mass = tilted * chain.start[:, None]
         if mass.sum() <= 0:  # no start can complete the mission: the reference process
-            mass = chain.start[:, None] * chain.mode_shares
+            mass = chain.start[:, None] * chain.first_mode_shares
         self._set_by_cell(per_cell, (mass / mass.sum()).ravel())
         # Before tick 0 nothing was read: a contradiction then restarts from the initial state.
         self._previous = (np.array([chain.initial], dtype=np.int32), np.ones(1))

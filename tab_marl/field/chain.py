@@ -66,7 +66,9 @@ class ProductChain(NamedTuple):
     start: NDArray[np.float64]
     """``[C]`` distribution of the first cell."""
     mode_shares: NDArray[np.float64]
-    """``[M]`` distribution of the first mode, before it is tilted by h."""
+    """``[M]`` distribution of the mode of the plain reference."""
+    first_mode_shares: NDArray[np.float64]
+    """``[M]`` the same at tick 0, before it is tilted by h."""
     centres: NDArray[np.float64]
     """``[C, 2]`` metres, in space ``[C, 3]``."""
     cell_metres: float
@@ -189,6 +191,7 @@ def product_chain(
         int(automaton.rejecting),
         first,
         reference.mode_shares(),
+        reference.first_mode_shares(),
         np.ascontiguousarray(places),
         float(cell_metres),
         reference.headings,

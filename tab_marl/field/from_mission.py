@@ -33,6 +33,8 @@ CELL_SIZES_METRES = (0.05, 0.1)
 """Tried in this order in a `Scenario` when `FieldOptions.cell_metres` is None."""
 CELLS_PER_TICK = (2.0, 1.0)
 """The same in a `Volume`: how many cells full speed covers in a tick."""
+HEADED = ("drive_and_turn", "run_and_tumble", "unicycle")
+"""References that remember the heading."""
 ROUGH_CELL_METRES = 0.15
 ROUGH_FROM = 1_500_000
 """Automaton states x base states from which a first fit on rough cells saves time."""
@@ -54,7 +56,7 @@ def problem_of(
         compiled = compile_mission(missions[0], world, world.step_seconds)
     else:
         compiled = compile_joint(missions, world, world.step_seconds)
-    headed = options.reference in ("run_and_tumble", "unicycle") and process is None
+    headed = options.reference in HEADED and process is None
     for size in _cell_sizes(world, options):
         grid = map_of(world, size)
         automaton = unroll(compiled, horizon, compiled.masks(grid.centres))
@@ -95,7 +97,7 @@ def _on_grid(
     horizon: int,
     process: Process | None,
 ) -> FieldProblem:
-    headed = process is None and options.reference in ("run_and_tumble", "unicycle")
+    headed = process is None and options.reference in HEADED
     refuse_before_building(automaton, grid.cells, options.headings if headed else 1, options)
     motion, which = _motion(grid, world, options, automaton.speed_limit, process)
     staged = {}
@@ -141,6 +143,13 @@ def _motion(
         return motion, which
     if options.reference == "run_and_tumble":
         return processes.run_and_tumble(grid, steps, options.headings, options.mean_run_metres), which
+    if options.reference == "drive_and_turn":
+        # In space a body moves any way it likes: it turns within a tick.
+        rate = (
+            processes.TYPICAL_TURN if isinstance(world, Volume) else world.adversary.max_turn_rate * world.step_seconds
+        )
+        rest = max(1.0, options.rest_seconds / world.step_seconds)
+        return processes.drive_and_turn(grid, steps, rate, rest, options.headings, options.mean_run_metres), which
     if options.reference == "unicycle":
         if isinstance(world, Volume):
             raise ValueError(

@@ -13,14 +13,18 @@ from tab_marl.world.scenario import UnknownName
 class FieldOptions:
     """How motion is modelled and which constraints beyond the mission hold."""
 
-    reference: Literal["run_and_tumble", "walk", "paper_walk", "unicycle"] = "run_and_tumble"
-    """`walk`: memoryless, displacements up to full speed. `paper_walk`: memoryless, all cells within one tick's reach.
+    reference: Literal["drive_and_turn", "run_and_tumble", "walk", "paper_walk", "unicycle"] = "run_and_tumble"
+    """`drive_and_turn`: straight runs, turns on the spot and rests; it begins at rest. `run_and_tumble`: turns take no
+    time. `walk`: memoryless, displacements up to full speed. `paper_walk`: memoryless, all cells within one tick's reach.
     `unicycle`: any speed and turn rate that the robot has, afresh each tick."""
     cell_metres: float | None = None
     """None: the finest of CELL_SIZES_METRES within `state_budget`."""
     headings: int = 16
-    """Directions of run-and-tumble and unicycle (in space 6, 14 or 26, and no unicycle); halved when even the coarsest cells exceed the budget."""
+    """Directions, where the reference has any (in space 6, 14 or 26); halved when even the coarsest cells exceed the budget."""
     mean_run_metres: float = 1.0
+    """Of run-and-tumble and drive-and-turn."""
+    rest_seconds: float = 10.0
+    """How long a rest lasts on average, in drive-and-turn."""
     goal_marginals: bool = True
     """Where several places can serve, each is visited equally often."""
     timing_prior: bool = False
@@ -50,7 +54,7 @@ class FieldOptions:
 
     def __post_init__(self) -> None:
         for name, known in (
-            ("reference", ("run_and_tumble", "walk", "paper_walk", "unicycle")),
+            ("reference", ("drive_and_turn", "run_and_tumble", "walk", "paper_walk", "unicycle")),
             ("kernel", ("bridge", "marginal")),
             ("precision", ("single", "double")),
         ):
@@ -59,6 +63,7 @@ class FieldOptions:
         for name in (
             "cell_metres",
             "mean_run_metres",
+            "rest_seconds",
             "marginal_tolerance",
             "constraint_tolerance",
             "state_budget",

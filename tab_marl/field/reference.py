@@ -67,6 +67,8 @@ class Reference:
     """``[R, M]``: the part of a row of `mix` that is a jump to a mode drawn from `redraw`; only a shorter way to compute."""
     redraw: NDArray[np.float64]
     """``[R, M]``."""
+    first: NDArray[np.bool_]
+    """``[M]``: the modes in which motion may begin."""
 
     @property
     def count(self) -> int:
@@ -121,6 +123,11 @@ class Reference:
         shares = np.linalg.lstsq(balance, np.append(np.zeros(modes), 1.0), rcond=None)[0]
         return np.asarray(np.clip(shares, 0.0, None) / np.clip(shares, 0.0, None).sum())
 
+    def first_mode_shares(self) -> NDArray[np.float64]:
+        """``[M]``: the distribution of the mode at tick 0, `mode_shares` among `first`."""
+        shares = self.mode_shares() * self.first
+        return np.asarray(shares / shares.sum())
+
     def matrix(self, r: int = 0) -> sparse.csr_array:
         """``[S, S]``: one whole tick (redraw, then move) of reference r as a sparse matrix."""
         states, modes = self.states, self.modes
@@ -138,6 +145,7 @@ def from_matrices(
     headings: ArrayLike | None = None,
     jump: ArrayLike | None = None,
     redraw: ArrayLike | None = None,
+    first: ArrayLike | None = None,
 ) -> Reference:
     """A reference from ``[S, S]`` matrices (dense or any SciPy sparse), one or a sequence of R.
 
@@ -146,6 +154,7 @@ def from_matrices(
         mix: ``[M, M]`` or ``[R, M, M]``, how the mode is redrawn before the move; default: one mode.
         headings: ``[M]`` radians.
         jump, redraw: ``[M]`` each: ``mix = near + outer(jump, redraw)`` with `near` sparse is computed faster.
+        first: ``[M]``, the modes in which motion may begin; default: all.
     Raises:
         ValueError: an entry is negative or not finite, a row sums to more than 1, or the shapes do not fit.
     """
@@ -178,6 +187,9 @@ def from_matrices(
     angles = np.full(modes, np.nan) if headings is None else np.asarray(headings, dtype=np.float64)
     if angles.shape != (modes,):
         raise ValueError(f"headings has shape {angles.shape}, must be [{modes}], one per mode")
+    beginning = np.ones(modes, dtype=bool) if first is None else np.asarray(first, dtype=bool)
+    if beginning.shape != (modes,) or not beginning.any():
+        raise ValueError(f"first has shape {beginning.shape}, must be [{modes}] with at least one mode True")
     lengths = np.concatenate([np.diff(p.indptr) for p in parts])
     indices, data = np.concatenate([p.indices for p in parts]), np.concatenate([p.data for p in parts])
     if lengths.max(initial=0) <= UNROLLED_WIDTH:
@@ -192,6 +204,7 @@ def from_matrices(
         np.broadcast_to(np.zeros(modes) if redraw is None else np.asarray(redraw), (len(parts), modes)).astype(
             np.float64
         ),
+        beginning,
     )
 
 

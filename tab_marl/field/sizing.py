@@ -1,4 +1,5 @@
-"""What a field problem takes, before it starts: states, bytes by arithmetic, seconds at a rate measured on the problem.
+"""What a field problem takes, before it starts: states, bytes by arithmetic, processor seconds at a rate measured on the
+problem.
 
 The rate is that of the problem's own reference: a few rows of messages are solved and timed, so that cells, moves,
 precision and machine are all in it. Where each automaton state can be is found first, and kept for the solver.
@@ -23,10 +24,10 @@ if TYPE_CHECKING:
     from tab_marl.field.problem import FieldProblem
 
 GIGABYTE = 1e9
-FEW_ROWS, MORE_ROWS = 2, 10
-"""Automaton states solved for the rate: the difference is the cost of a state, the rest that of starting."""
-TIMED_AT_MOST, TIMING_SECONDS = 5, 0.2
-"""Repetitions, and the time after which none is begun; the fastest counts."""
+FEW_ROWS = 4
+"""Automaton states of the first of the automata that are timed; each further one has twice as many."""
+TIMED_SECONDS = 0.05
+"""A pass that takes this long says enough."""
 PAGE_BYTES = 4096
 MOVE_BYTES, LEAST_MOVES = 12, 4
 """Of an entry of a reference's sparse rows (index and probability), and entries of a row at least."""
@@ -112,7 +113,7 @@ def size_of(problem: FieldProblem) -> FieldSize:
         ticks=int(automaton.rank.max()) - 1,
         passes=min(USUAL_ROUNDS, problem.options.max_iterations) if fitted else 1,
         memory=memory_of(problem),
-        seconds_per_pass=_seconds_of_pass(problem, fitted),
+        seconds_per_pass=_seconds_of_pass(problem, tilt, fitted),
     )
 
 
@@ -217,41 +218,54 @@ def _remedy(options: FieldOptions) -> str:
     )
 
 
-def _seconds_of_pass(problem: FieldProblem, fitted: bool) -> float:
-    """Chains of few and of more states on this problem's reference, solved and timed: a cost per state and one apart."""
+def _seconds_of_pass(problem: FieldProblem, tilt: Tilt, fitted: bool) -> float:
+    """Counting automata of more and more states on this problem's reference, until one takes long enough to time.
+
+    A few states would fit into the cache and into memory at hand, and say little about hundreds.
+    """
     from tab_marl.field.solve import layout
 
-    small = [_counting(problem, rows) for rows in (FEW_ROWS, MORE_ROWS)]
-    for one in small:  # loads the compiled code, and prepares what all passes share
-        _timed(one, fitted)
-    began = time.perf_counter()
-    samples: list[list[float]] = []
-    while len(samples) < TIMED_AT_MOST and (not samples or time.perf_counter() - began < TIMING_SECONDS):
-        samples.append([_timed(one, fitted) for one in small])
-    at_few, at_more = np.min(samples, axis=0)  # the machine's other work only adds
-    per_row = max(at_more - at_few, 0.0) / (MORE_ROWS - FEW_ROWS)
     # Rows are solved for where they can matter: that many whole rows, without the initial and the absorbing ones.
-    possible = layout(problem, bool(np.isfinite(_tilt_of(problem).log_failure)))[0].possible
+    possible = layout(problem, bool(np.isfinite(tilt.log_failure)))[0].possible
     automaton = problem.automaton
     ended = [automaton.initial, automaton.accepting, automaton.rejecting]
     rows = float(np.delete(possible, ended, axis=0).sum(dtype=np.int64)) / problem.cells
-    return float(max(0.0, at_few - FEW_ROWS * per_row) + per_row * rows)
+    sampled = fitted and not problem.constraints and not tilt.scaling_is_exact
+    few = more = FEW_ROWS
+    at_few = at_more = _timed(problem, few, fitted, sampled)
+    while at_more < TIMED_SECONDS and more < rows:
+        few, at_few = more, at_more
+        more = min(2 * more, max(1, round(rows)))
+        at_more = _timed(problem, more, fitted, sampled)
+    per_row = (at_more - at_few) / (more - few) if more > few and at_more > at_few else at_more / more
+    return float(max(at_more + per_row * (rows - more), at_more * rows / more))
 
 
-def _timed(problem: FieldProblem, fitted: bool) -> float:
+def _timed(problem: FieldProblem, rows: int, fitted: bool, sampled: bool) -> float:
+    """Seconds of one pass over a counting automaton of so many states: the mean of two."""
+    from tab_marl.field.belief import ProductBelief
     from tab_marl.field.constraints import Tilt
-    from tab_marl.field.solve import message
+    from tab_marl.field.sampling import sample_paths
+    from tab_marl.field.solve import SAMPLED_PATHS, message
     from tab_marl.field.tab_field import expected_transitions
 
-    began = time.perf_counter()
-    chain = message(problem, Tilt.of(problem))
-    if fitted:
-        expected_transitions(chain, problem.automaton.rank)
-    return time.perf_counter() - began
+    small = _counting(problem, rows)
+    repetitions = 2
+    for repetition in range(repetitions + 1):
+        if repetition == 1:  # the first one loads the compiled code, and prepares what all passes share
+            began = time.thread_time()  # what other programs take does not count
+        chain = message(small, Tilt.of(small))
+        if fitted:
+            expected_transitions(chain, small.automaton.rank)
+        if sampled:
+            # As many steps for a row as a mission of this many rows and ticks takes.
+            paths = max(1, round(SAMPLED_PATHS * float(problem.automaton.rank.max()) / len(problem.automaton.delta)))
+            sample_paths(chain, ProductBelief(chain), np.random.default_rng(0), paths, rows)
+    return (time.thread_time() - began) / repetitions
 
 
 def _counting(problem: FieldProblem, rows: int) -> FieldProblem:
-    """The problem with an automaton that counts so many ticks and accepts."""
+    """The problem with an automaton that counts so many ticks and accepts, started anywhere."""
     symbols = problem.automaton.delta.shape[1]
     count = rows + 1
     following = np.append(np.arange(1, count + 1), [count, count + 1]).astype(np.int32)
@@ -275,6 +289,6 @@ def _counting(problem: FieldProblem, rows: int) -> FieldProblem:
         problem.options, goal_marginals=False, timing_prior=False, completion_probability=1.0, only_reachable=False
     )
     return replace(
-        problem, automaton=automaton, options=options, reference_of=None, stage=None, stage_names=("mission",),
+        problem, automaton=automaton, start=np.full(problem.cells, 1 / problem.cells), options=options, reference_of=None, stage=None, stage_names=("mission",),
         status=None, mission=None, constraints=(), tracking=None, rough=None,
     )  # fmt: skip

@@ -18,11 +18,13 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from tab_marl.field.constraints import Tilt
+from tab_marl.field.events import Tracker
+from tab_marl.field.infeasible import InfeasibleField
 from tab_marl.field.problem import FieldOptions, FieldProblem
 from tab_marl.field.reference import Reference
 from tab_marl.field.report import ConstraintFit, FitReport
 from tab_marl.field.tab_field import TabField
-from tab_marl.field.tracking import TrackedAutomaton, Tracker, Tracking
+from tab_marl.field.tracking import TrackedAutomaton, Tracking
 from tab_marl.mission.serialise import mission_from_json, mission_to_json
 from tab_marl.mission.unroll import TickAutomaton
 from tab_marl.world.grid import GridMap
@@ -36,7 +38,7 @@ MOST_BYTES = 8_000_000_000
 MOST_BRANCHES = 10_000
 GRIDS: dict[str, type[GridMap | VoxelMap]] = {"GridMap": GridMap, "VoxelMap": VoxelMap}
 WORLDS: dict[str, type[Scenario | Volume]] = {"Scenario": Scenario, "Volume": Volume}
-REFERENCE = ("indptr", "indices", "data", "mix", "headings", "jump", "redraw")
+REFERENCE = ("indptr", "indices", "data", "mix", "headings", "jump", "redraw", "first")
 AUTOMATON = ("delta", "masks", "rank", "location", "branch", "mission_ticks", "stage_ticks", "speed_limit", "clocks")
 
 
@@ -90,7 +92,7 @@ def save_field(field: TabField, path: str | Path) -> None:
 
 def load_field(path: str | Path) -> TabField:
     """See `TabField.load`. Raises FieldFormatError, OSError."""
-    from tab_marl.field.solve import InfeasibleField, message
+    from tab_marl.field.solve import message
 
     try:
         header, arrays = _read(Path(path))
@@ -239,7 +241,7 @@ def _reference(arrays: dict[str, NDArray[Any]]) -> Reference:
         raise FieldFormatError("reference.jump and reference.redraw: must be finite")
     return Reference(
         indptr.astype(np.int64), indices.astype(np.int32), data, mix,
-        _array(arrays, "reference.headings", "f", (modes,)), jump, redraw,
+        _array(arrays, "reference.headings", "f", (modes,)), jump, redraw, _array(arrays, "reference.first", "b", (modes,)),
     )  # fmt: skip
 
 

@@ -175,8 +175,10 @@ class TabField:
         return self._lifted(tracked, weight)
 
     def _lifted(self, problem: FieldProblem, log_weight: Floats) -> TabField:
+        from tab_marl.field.sizing import refuse_beyond_memory
         from tab_marl.field.solve import message
 
+        refuse_beyond_memory(problem)
         tilt = Tilt.given(problem, log_weight, self.tilt.log_failure)
         return TabField(problem, message(problem, tilt), tilt, None, self.marginal_error, self.rounds, self.report)
 
@@ -265,7 +267,7 @@ def start_log_partition(chain: ProductChain) -> Floats:
     table = chain.value.reshape(len(chain.value), chain.cells, chain.modes)
     peak = float(chain.value[chain.accepting, 0])
     for cell in np.flatnonzero(chain.start > 0):
-        total = float(table[first[cell], cell].astype(np.float64) @ chain.mode_shares)
+        total = float(table[first[cell], cell].astype(np.float64) @ chain.first_mode_shares)
         factor = chain.factor[chain.initial, chain.labels[cell]]
         if total > 0 and factor > 0:
             out[cell] = np.log(total) - np.log(peak) + np.log(factor) + chain.log_scale[chain.initial]

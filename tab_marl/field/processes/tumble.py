@@ -32,21 +32,11 @@ def run_and_tumble(
             is rest.
         mean_run_metres: scale of the run length at the first (full) speed.
     """
-    if headings < 3:
-        raise ValueError(f"headings is {headings}, must be >= 3")
     if not mean_run_metres > 0:
         raise ValueError(f"mean_run_metres is {mean_run_metres}, must be > 0")
     speeds = speeds_of(metres_per_tick)
-    planar = grid.index.shape[1] == 2
-    if planar:
-        angles = 2 * np.pi * np.arange(headings) / headings
-        direction = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        beside = np.roll(np.eye(headings), 1, axis=1) + np.roll(np.eye(headings), -1, axis=1)
-    else:
-        direction = spatial_directions(headings)
-        headings = len(direction)
-        angles = np.full(headings, np.nan)
-        beside = _nearest(direction)
+    direction, angles, beside = compass(grid, headings)
+    headings = len(direction)
     # An event rate per metre of run; many events in one tick saturate at certainty.
     events = min(1.0, speeds[0] / mean_run_metres * (TURNS_PER_RUN + REDRAWS_PER_RUN))
     turn = events * TURNS_PER_RUN / (TURNS_PER_RUN + REDRAWS_PER_RUN)
@@ -64,6 +54,18 @@ def run_and_tumble(
         moves = [*(speed * direction), rest]
         parts.append(rows_of(grid, [rounded(move, 1.0, grid.cell_metres, m) for m, move in enumerate(moves)]))
     return from_matrices(parts, mix, np.append(angles, np.nan), np.full(headings + 1, redraw), anew)
+
+
+def compass(grid: Cells, headings: int) -> tuple[Floats, Floats, Floats]:
+    """Unit vectors ``[H, D]``, their angles ``[H]`` in radians (nan in space), and which are neighbours, ``[H, H]``."""
+    if headings < 3:
+        raise ValueError(f"headings is {headings}, must be >= 3")
+    if grid.index.shape[1] != 2:
+        direction = spatial_directions(headings)
+        return direction, np.full(len(direction), np.nan), _nearest(direction)
+    angles = 2 * np.pi * np.arange(headings) / headings
+    beside = np.roll(np.eye(headings), 1, axis=1) + np.roll(np.eye(headings), -1, axis=1)
+    return np.stack([np.cos(angles), np.sin(angles)], axis=1), angles, beside
 
 
 def spatial_directions(headings: int) -> Floats:
