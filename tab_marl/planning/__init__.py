@@ -6,8 +6,13 @@
 from __future__ import annotations
 
 from tab_marl.planning.belief import BeliefDepleted, update_particles
+from tab_marl.planning.cycle import Game, play
 from tab_marl.planning.despot import Despot, DespotOptions
+from tab_marl.planning.exact_filter import ExactFilter
+from tab_marl.planning.explanation import Explanation
+from tab_marl.planning.filter_report import BeliefWarning, FilterReport, ImpossibleObservation
 from tab_marl.planning.model import CompiledModel, ContinuousModel, Particles, PlainPythonWarning, PythonModel
+from tab_marl.planning.particle_filter import FilterOptions, ParticleFilter
 from tab_marl.planning.plan import Plan, Planner
 from tab_marl.planning.pomcp import Pomcp, PomcpOptions
 from tab_marl.planning.pomcpow import Pomcpow, PomcpowOptions
@@ -16,10 +21,18 @@ from tab_marl.planning.tree import SearchTree
 
 __all__ = [
     "BeliefDepleted",
+    "BeliefWarning",
     "CompiledModel",
     "ContinuousModel",
     "Despot",
     "DespotOptions",
+    "ExactFilter",
+    "Explanation",
+    "FilterOptions",
+    "FilterReport",
+    "Game",
+    "ImpossibleObservation",
+    "ParticleFilter",
     "Particles",
     "PlainPythonWarning",
     "Plan",
@@ -30,6 +43,7 @@ __all__ = [
     "PomcpowOptions",
     "PythonModel",
     "SearchTree",
+    "play",
     "table_model",
     "update_particles",
 ]
