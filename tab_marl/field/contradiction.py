@@ -144,16 +144,18 @@ class _Law:
         cost = np.concatenate([np.zeros(n), np.ones(2 * k)])
         equal = np.block([[self.rows, np.zeros((len(self.start), 2 * k))], [events, np.eye(k), -np.eye(k)]])
         found = optimize.linprog(cost, A_eq=equal, b_eq=np.concatenate([self.start, wanted[which]]), bounds=(0, None))
+        assert found.fun is not None and found.x is not None  # the slacks make it feasible
         return float(found.fun), np.asarray(found.x[:n] @ self.happened[self.pattern])
 
     def range(self, k: int) -> tuple[float, float]:
         """The least and the largest probability of event k alone."""
         cost = self.happened[self.pattern, k]
-        ends = [
-            sign * optimize.linprog(sign * cost, A_eq=self.rows, b_eq=self.start, bounds=(0, None)).fun
-            for sign in (1.0, -1.0)
-        ]
-        return float(ends[0]), float(ends[1])
+        ends = []
+        for sign in (1.0, -1.0):
+            found = optimize.linprog(sign * cost, A_eq=self.rows, b_eq=self.start, bounds=(0, None))
+            assert found.fun is not None  # every start cell has a pattern
+            ends.append(sign * float(found.fun))
+        return ends[0], ends[1]
 
 
 def _range(low: float, high: float) -> str:

@@ -37,7 +37,8 @@ def draw_field(field: TabField, path: str | Path | None = None, panels: int = 8)
     columns = min(5, len(ticks) + 1)
     rows = -(-(len(ticks) + 1) // columns)
     figure = _figure(2.5 * columns, 2.75 * rows + 2.0)
-    upper, lower = figure.subfigures(2, 1, height_ratios=[2.75 * rows, 2.0])
+    parts: Any = figure.subfigures(2, 1, height_ratios=[2.75 * rows, 2.0])
+    upper, lower = parts
     axes = np.atleast_1d(upper.subplots(rows, columns)).ravel()
     for axis, t in zip(axes, ticks, strict=False):
         _draw_shade(axis, grid, scenario, field.occupancy[t])

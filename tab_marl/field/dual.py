@@ -319,7 +319,7 @@ class _Ascent:
             self._once()
             return
         try:
-            found = optimize.minimize(
+            found = optimize.minimize(  # type: ignore[call-overload]
                 self.evaluate, self.features.start, jac=True, method="BFGS", callback=self._count,
                 options={
                     "gtol": 0.0, "maxiter": self.problem.options.max_iterations,

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,9 +38,9 @@ class Tracker:
     """
 
     name: str
-    labels: NDArray[np.int32]
+    labels: NDArray[np.integer[Any]]
     """``[C]`` symbol of each cell."""
-    delta: NDArray[np.int32]
+    delta: NDArray[np.integer[Any]]
     """``[E, L]`` next state."""
     initial: int
     """State before tick 0 is read."""

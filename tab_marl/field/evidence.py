@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tab_marl.field.belief import BeliefOptions, disc_cover, mode_likelihood, position_kernel
 from tab_marl.field.chain import ProductChain
+from tab_marl.world.scenario import Checkpoint
 
 if TYPE_CHECKING:
     from tab_marl.field.problem import FieldProblem
@@ -56,7 +57,7 @@ class Unseen:
 
     tick: int
     cover: ArrayLike | None = None
-    """``[C]`` how much of each cell is in view, 0 to 1 or bool. None: the cameras of the scenario's checkpoints."""
+    """``[C]`` how much of each cell is in view, 0 to 1 or bool. None: the cameras (in space: the sensors) of the checkpoints."""
     ego: tuple[float, ...] | None = None
     """Metres; it is not within `radius_metres` of this point either."""
     radius_metres: float = 0.0
@@ -103,6 +104,6 @@ def camera_cover(problem: FieldProblem, chain: ProductChain) -> Floats:
         raise ValueError("Unseen needs `cover`: this problem has no scenario whose cameras could be meant")
     cover = np.zeros(chain.cells)
     for checkpoint in problem.scenario.checkpoints:
-        camera = checkpoint.camera
-        cover = np.maximum(cover, disc_cover(chain, camera.centre, camera.radius))
+        sensor = checkpoint.camera if isinstance(checkpoint, Checkpoint) else checkpoint.sensor
+        cover = np.maximum(cover, disc_cover(chain, sensor.centre, sensor.radius))
     return cover

@@ -11,6 +11,7 @@ from scipy import sparse
 
 from tab_marl.field import path_kernels
 from tab_marl.field.belief import EXACT, ProductBelief
+from tab_marl.field.chain import Table
 from tab_marl.field.problem import COMPLETE, FAILED, UNDER_WAY
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ class MostLikelyPath:
         return len(self.cells)
 
 
-def path_entropy(field: TabField, visits: Floats) -> float:
+def path_entropy(field: TabField, visits: Table) -> float:
     """Entropy in nats of the trajectory (start, cells and modes) up to the tick at which the mission ends.
 
     `visits` ``[Q, S]``: probability of ever visiting (q, s). By the chain rule, the start's entropy and that of each step.
@@ -90,9 +91,10 @@ def most_likely_path(field: TabField, completing: bool = True) -> MostLikelyPath
     start = ProductBelief(chain, EXACT)
     with np.errstate(divide="ignore", invalid="ignore"):
         # P(start state) is the filter's; what follows has weight best / h.
-        h = np.log(chain.value.astype(np.float64) / peak)[start.automaton_states] + chain.log_scale[
-            start.automaton_states, None
-        ]
+        h = (
+            np.log(chain.value.astype(np.float64) / peak)[start.automaton_states]
+            + chain.log_scale[start.automaton_states, None]
+        )
         score = np.where(start.masses > 0, np.log(start.masses) + best[start.automaton_states] - h, -np.inf)
     row, s = np.unravel_index(int(np.argmax(score)), score.shape)
     q = int(start.automaton_states[row])

@@ -35,7 +35,7 @@ def moments(chain: ProductChain, ticks: int, options: BeliefOptions) -> Iterator
     """Ticks 0 to `ticks`; `options` says which masses are dropped on the way."""
     belief = ProductBelief(chain, options)
     symbols = chain.delta.shape[1]
-    first = np.bincount(chain.labels, belief.cell_marginal(), minlength=symbols)[None]
+    first = np.asarray(np.bincount(chain.labels, belief.cell_marginal(), minlength=symbols)[None], dtype=np.float64)
     active, masses = belief.automaton_states, belief.masses
     yield Moment(0, active, masses, np.array([chain.initial], dtype=np.int32), first)
     for tick in range(1, ticks + 1):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,7 +141,7 @@ class _Product:
         return cls(problem.automaton, trackers, np.asarray(problem.status), alphabet, labels.ravel())
 
     @property
-    def deltas(self) -> list[NDArray[np.int32]]:
+    def deltas(self) -> list[NDArray[np.integer[Any]]]:
         return [self.automaton.delta, *(t.delta for t in self.trackers)]
 
     @property
