@@ -8,12 +8,14 @@ below holds the address of the function proper and is made once; calls through i
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
 from numba import njit, types
 from numba.core import cgutils
+from numba.core.errors import NumbaError
 from numba.experimental.function_type import FunctionModel
 from numba.extending import NativeValue, register_model, unbox
 
@@ -35,16 +37,37 @@ def _unbox_callback(typ: Any, obj: Any, c: Any) -> Any:
     return NativeValue(function._getvalue())
 
 
+def _compiled(function: Callable[..., Any], signature: Any) -> Any:
+    try:
+        return njit(signature, cache=True)(function)
+    except RuntimeError as error:  # a function typed at a prompt has no file beside which to keep a cache
+        if "locator" not in str(error):
+            raise
+    return njit(signature)(function)
+
+
+def _reason(error: NumbaError) -> str:
+    """The lines of numba's message that say what and where."""
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", str(error))
+    lines = [line.strip() for line in plain.splitlines()]
+    telling = [
+        line for line in lines if line.startswith(("No implementation", "No conversion", "Cannot", "Can't", ">>>"))
+    ]
+    places = [line for line in lines if line.startswith("File ")]
+    return " ".join([*(telling[:2] or lines[:2]), *places[-1:]]).rstrip(":")
+
+
 class Callback:
     """A function compiled for one signature."""
 
     def __init__(self, function: Callable[..., Any], signature: Any) -> None:
         try:
-            compiled = njit(signature, cache=True)(function)
-        except RuntimeError as error:  # a function typed at a prompt has no file beside which to keep a cache
-            if "locator" not in str(error):
-                raise
-            compiled = njit(signature)(function)
+            compiled = _compiled(function, signature)
+        except NumbaError as error:
+            raise TypeError(
+                f"{function.__name__} does not compile as {signature}: {_reason(error)}. See tab_marl.planning.model for what "
+                "a model's functions take and return; options with compiled=False run them interpreted"
+            ) from error
         result = compiled.get_compile_result(signature)
         self._keep = compiled  # the machine code lives as long as this
         self.address = int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))

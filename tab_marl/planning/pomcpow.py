@@ -187,7 +187,7 @@ class _Growth:
         self._search(np.empty(0, dtype=np.int64))
 
     def _enlarge(self) -> None:
-        if self.used[kernels.NODES] >= len(self.nodes):
+        if self.used[kernels.NODES] >= len(self.nodes) < self.node_cap:
             size, actions = min(self.node_cap, 2 * len(self.nodes)), self.model.actions
             self.nodes, self.beliefs, self.seen = (grown(a, size) for a in (self.nodes, self.beliefs, self.seen))
             self.edges, self.edge_actions, self.widths = (

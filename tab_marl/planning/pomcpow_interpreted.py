@@ -161,6 +161,7 @@ class _Search:
                 if child is not None:
                     child.generated += 1
                     edge.generated += 1
+                    child = None  # counted, but not followed: see the kernel
                 elif room and len(path) <= options.deepest_node and self.rows + FIRST_ROOM <= self.row_cap:
                     weight = self.weight(before, edge.action, state, seen, own=True)
                     self.nodes.append(_Node(len(self.nodes), seen))

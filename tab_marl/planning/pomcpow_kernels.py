@@ -184,8 +184,10 @@ def search(
                         insert(beliefs, child, pool_states, pool_rewards, pool_weights, used, state, reward, weight)
                         break
                 else:
+                    # Counted, but not followed: a state that chose its observation must not be weighed by it as well.
                     beliefs[child]["generated"] += 1
                     widths[edge, 1] += 1
+                    child = np.int64(NO_CHILD)
             if child < 0:
                 if widths[edge, 1] == 0:
                     break

@@ -18,43 +18,12 @@ from tab_marl.planning.tree import NO_PARENT, ROOT
 heavy = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="takes hours interpreted")
 
 
-def same_tree(a, b) -> bool:
-    return (
-        np.array_equal(a.nodes, b.nodes)
-        and np.array_equal(a.edges, b.edges)
-        and np.array_equal(a.edge_actions, b.edge_actions)
-    )
-
-
 # ---- exact values
-
-
-def random_pomdp(seed: int):
-    rng = np.random.default_rng(seed)
-    transition = rng.dirichlet(np.ones(3), size=(2, 3))
-    observation = rng.dirichlet(np.full(2, 0.5), size=(2, 3))
-    reward = rng.normal(size=(2, 3, 3))
-    terminal = np.array([False, False, True])
-    return transition, observation, reward, terminal
-
-
-def expectimax(pomdp, belief, depth, discount):
-    """Best values [A] of each action by enumerating all observations, from an unnormalised belief."""
-    transition, observation, reward, terminal = pomdp
-    values = np.zeros(len(transition))
-    for a in range(len(transition)):
-        joint = belief[:, None] * transition[a]
-        values[a] = (joint * reward[a]).sum()
-        after = np.where(terminal, 0.0, joint.sum(axis=0))
-        if depth > 1:
-            for o in range(observation.shape[2]):
-                values[a] += discount * expectimax(pomdp, after * observation[a][:, o], depth - 1, discount).max()
-    return values
 
 
 @heavy
 @pytest.mark.parametrize("seed", range(6))
-def test_values_agree_with_expectimax(seed):
+def test_values_agree_with_expectimax(seed, random_pomdp, expectimax):
     pomdp = random_pomdp(seed)
     exact = expectimax(pomdp, np.array([0.5, 0.5, 0.0]), 3, 0.9)
     planner = Pomcp(table_model(*pomdp), PomcpOptions(simulations=60000, exploration=2.0, discount=0.9, max_depth=3))
@@ -65,7 +34,7 @@ def test_values_agree_with_expectimax(seed):
 
 
 @heavy
-def test_the_error_falls_like_the_root_of_the_simulations():
+def test_the_error_falls_like_the_root_of_the_simulations(random_pomdp, expectimax):
     # With one action there is nothing to choose: what is left is the error of sampling.
     transition, observation, reward, terminal = random_pomdp(0)
     pomdp = (transition[:1], observation[:1], reward[:1], terminal)
@@ -86,28 +55,9 @@ def test_the_error_falls_like_the_root_of_the_simulations():
     assert -0.6 < slope < -0.4
 
 
-def tiger_value(policy=None, discount=0.95, reach=12):
-    """Exact Tiger: the belief is the surplus of growls heard on the left. Value at surplus 0, and the best action at each."""
-    surplus = np.arange(-reach, reach + 1)
-    left = 1 / (1 + (0.15 / 0.85) ** surplus)
-    value = np.zeros(len(surplus))
-    for _ in range(2000):
-        hear_left = 0.85 * left + 0.15 * (1 - left)
-        up, down = np.append(value[1:], value[-1]), np.insert(value[:-1], 0, value[0])
-        q = np.array(
-            [
-                -1 + discount * (hear_left * up + (1 - hear_left) * down),
-                -100 * left + 10 * (1 - left) + discount * value[reach],
-                10 * left - 100 * (1 - left) + discount * value[reach],
-            ]
-        )
-        value = q.max(axis=0) if policy is None else q[policy, np.arange(len(surplus))]
-    return value[reach], q.argmax(axis=0)
-
-
 @heavy
 @pytest.mark.parametrize("seed", range(3))
-def test_tiger_is_played_optimally(seed):
+def test_tiger_is_played_optimally(seed, tiger_value):
     best, optimal = tiger_value()
     assert best == pytest.approx(19.37, abs=0.01)  # the published optimum
     planner = Pomcp(textbook.tiger(), PomcpOptions(simulations=20000, exploration=150.0, max_depth=25))
@@ -190,7 +140,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_kernel_builds_the_same_tree_as_its_slow_twin(case):
+def test_the_kernel_builds_the_same_tree_as_its_slow_twin(case, same_tree):
     model, belief, changes, root = CASES[case]
     options = PomcpOptions(**({"simulations": 700, "exploration": 5.0} | changes))
     fast = Pomcp(model, options).plan(belief, 3, **root)
@@ -200,7 +150,7 @@ def test_the_kernel_builds_the_same_tree_as_its_slow_twin(case):
     assert fast.steps >= 700 or case == "dead ends"
 
 
-def test_a_seed_fixes_the_tree_and_another_changes_it():
+def test_a_seed_fixes_the_tree_and_another_changes_it(same_tree):
     model, belief = textbook.tag(), textbook.TagBelief(4).sample(300, np.random.default_rng(0))
     planner = Pomcp(model, PomcpOptions(simulations=500))
     first, again, other = (
@@ -213,7 +163,7 @@ def test_a_seed_fixes_the_tree_and_another_changes_it():
 
 
 @heavy
-def test_the_tree_does_not_depend_on_how_often_the_arrays_grew(monkeypatch):
+def test_the_tree_does_not_depend_on_how_often_the_arrays_grew(monkeypatch, same_tree):
     model, belief = textbook.tag(), textbook.TagBelief(4).sample(300, np.random.default_rng(0))
     options = PomcpOptions(simulations=900)
     whole = Pomcp(model, options).plan(belief, 8)

@@ -23,14 +23,6 @@ from tab_marl.planning.tree import ROOT
 heavy = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="takes hours interpreted")
 
 
-def same_tree(a, b) -> bool:
-    return (
-        np.array_equal(a.nodes, b.nodes)
-        and np.array_equal(a.edges, b.edges)
-        and np.array_equal(a.edge_actions, b.edge_actions)
-    )
-
-
 def noisy_step(state, action, data, rng):
     state[0] += uniform(rng)
     return np.int64(state[0]), state[0] * 0.1 - action * data[0], state[0] > 4.0
@@ -69,7 +61,7 @@ def test_the_tree_after_a_step_is_the_part_below_it():
     assert rebuilt(some, ROOT) == tuple(part for part in rebuilt(after, ROOT) if part[0] in (1, 4))
 
 
-def test_a_search_goes_on_with_a_tree():
+def test_a_search_goes_on_with_a_tree(same_tree):
     options = PomcpOptions(simulations=600)
     planner = Pomcp(textbook.tag(), options)
     before = planner.plan([[3, 9], [3, 20]], 1)
