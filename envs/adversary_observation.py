@@ -262,6 +262,8 @@ class AdversaryObserver:
         automaton's location and clocks (in control steps), and the ego's position if the adversary sees it.
         All zero once the mission has ended (location < 0).
         """
+        if location < 0:
+            return np.zeros(OBSERVED, dtype=np.float32)
         self._clocks[:] = clocks
         ego_x, ego_y = ego or (0.0, 0.0)
         kernels.observe(

@@ -84,7 +84,8 @@ class Episode:
         active = self.monitor.status == "active"
         arena.command(ego, adversary)
         met = False
-        if self._sight is not None or arena.squared_gap() > self._safe_gap:
+        (ego_x, ego_y, *_), (x, y, *_) = self.motion
+        if self._sight is not None or (x - ego_x) ** 2 + (y - ego_y) ** 2 > self._safe_gap:
             arena.run(self.substeps_per_step)
             self.physics_steps += self.substeps_per_step
         else:

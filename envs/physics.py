@@ -190,7 +190,7 @@ class Arena:
 class _Drive:
     """One robot: its body, the wheel that leads it and the two joints between them."""
 
-    __slots__ = ("_parts", "_pivot", "_substep_seconds", "_wheel", "body", "v", "w")
+    __slots__ = ("_parts", "_pivot", "_rolls", "_substep_seconds", "_wheel", "body", "v", "w")
 
     def __init__(self, space: Space, robot: Robot, pose: Start, substep_seconds: float, kind: int) -> None:
         mass, radius = robot.mass_kilograms, robot.radius_metres
@@ -210,6 +210,8 @@ class _Drive:
         self._pivot.max_bias = gear.max_bias = 0.0
         self._pivot.max_force = MOTOR_STRENGTH * mass * robot.max_speed / substep_seconds
         gear.max_force = MOTOR_STRENGTH * self.body.moment * robot.max_turn_rate / substep_seconds
+        self._rolls = False
+        """Whether the wheel moves straight on; else it turns about a point that stands still."""
         self._parts = (self.body, hull, self._wheel, self._pivot, gear)
         space.add(*self._parts)
 
@@ -228,13 +230,16 @@ class _Drive:
             velocity = (v * math.cos(theta), v * math.sin(theta))
             _set_anchor(self._pivot, (0.0, 0.0))
             _set_velocity(self._wheel, velocity)
+            self._rolls = True
         else:
             # The chord of one substep is shorter than its arc by sin(a)/a, and turned by a, half the substep's turn.
             chord_speed = v * math.sin(half_turn) / half_turn
             velocity = (chord_speed * math.cos(theta + half_turn), chord_speed * math.sin(theta + half_turn))
             radius = chord_speed / w
             _set_anchor(self._pivot, (radius * math.sin(half_turn), -radius * math.cos(half_turn)))
-            _set_velocity(self._wheel, (0.0, 0.0))
+            if self._rolls:
+                _set_velocity(self._wheel, (0.0, 0.0))
+                self._rolls = False
         # Positions move with the old velocity before the joints act. In free space the new one is set at once, so that a
         # command does not lag a substep; in contact it is left to the solver, which would otherwise be pushed into the wall.
         if not touching:
