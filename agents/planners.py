@@ -278,9 +278,10 @@ def _action(routes: RouteMap, pose: tuple[float, float, float], route: int) -> N
 
 
 def goal_places(task: Task) -> tuple[tuple[float, float], ...]:
-    """Centres of all places where the mission's goals may be: the ego may want to wait at each."""
+    """Centres of all places where the mission's goals may be, and of the ego's own goal: it may want to stand at each."""
     regions = (region_of(place, task.scenario) for goal in task.mission.goals for place in goal.places)
-    return tuple(dict.fromkeys(region.centre for region in regions))
+    own = () if task.scenario.ego_goal is None else (task.scenario.ego_goal.centre,)
+    return tuple(dict.fromkeys([*(region.centre for region in regions), *own]))
 
 
 def zoo_rollouts(task: Task, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.int32]]:

@@ -15,6 +15,7 @@ from tab_marl.field.tab_field import TabField
 from tab_marl.mission.model import Mission
 from tab_marl.planning.models.interface import SampledPaths, TickObservation
 from tab_marl.planning.models.mission_map import MissionMap
+from tab_marl.planning.models.sight import Sight
 from tab_marl.world.grid import GridMap
 from tab_marl.world.scenario import Scenario
 
@@ -79,7 +80,7 @@ class FieldModel:
         belief = self.belief
         under_way = belief.automaton_states != belief.chain.accepting
         hunting = 1.0 - belief.completed < ALL_DONE
-        if not hunting and not under_way.all():
+        if self.scenario.ego_task == "interception" and not hunting and not under_way.all():
             belief = belief.copy()
             belief.masses = belief.masses[under_way] / belief.masses[under_way].sum()
             belief.automaton_states = belief.automaton_states[under_way]
@@ -93,7 +94,11 @@ class FieldModel:
     def _condition(self, observation: TickObservation) -> None:
         seen, scenario = observation.sighting, self.scenario
         if seen is None or not observation.seen_now:
-            self.belief.condition_on_unseen(self._cover, observation.ego, scenario.interception_metres)
+            cover = self._cover
+            if scenario.ego_task == "surveillance":
+                in_sight = Sight.of(scenario).watched(observation.ego, self.grid.centres, scenario.watch_metres)
+                cover = np.maximum(cover, in_sight)
+            self.belief.condition_on_unseen(cover, observation.ego, scenario.interception_metres)
         if seen is not None:
             # Seen within the tick but not at its end: it drove on.
             travelled = seen.speed * seen.age_seconds

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from tab_marl.planning.models import walk_kernels as kernels
 from tab_marl.planning.models.interface import AdversaryModel, SampledPaths, TickObservation
 from tab_marl.planning.models.mission_map import MissionMap
+from tab_marl.planning.models.sight import noticed
 from tab_marl.world.grid import GridMap
 
 
@@ -130,6 +131,5 @@ class Guarded:
             return
         reach = (observation.tick - self._seen_tick + 1) * self.map.reach_metres
         possible = self._metres <= reach
-        possible &= ~scenario.seen(grid.centres)
-        possible &= np.hypot(*(grid.centres - observation.ego).T) > scenario.interception_metres
+        possible &= ~noticed(scenario, grid.centres, observation.ego)
         self._possible = np.flatnonzero(possible)

@@ -66,7 +66,8 @@ class AdversaryModel(Protocol):
         """Draw futures given everything observed so far.
 
         Paths whose mission is completed already are left out as long as others are possible: no decision changes them.
-        If none is possible the hunt goes on, with `completed_tick` -1.
+        If none is possible the hunt goes on, with `completed_tick` -1. In ego tasks other than interception the mission's
+        completion changes nothing, and no path is left out.
         """
 
     def occupancy(self) -> tuple[GridMap, NDArray[np.float64]]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tab_marl.planning.models import walk_kernels
 from tab_marl.planning.models.interface import SampledPaths, TickObservation
 from tab_marl.planning.models.mission_map import MissionMap
+from tab_marl.planning.models.sight import noticed
 from tab_marl.world.grid import GridMap
 from tab_marl.world.scenario import Scenario
 
@@ -96,8 +97,7 @@ class TrajectoryPool:
             evidence = np.maximum(-squared / (2 * self.options.sight_metres**2), least)
             self._seen, self.log_evidence = (self._tick, point), 0.0
         else:
-            near = np.hypot(*(here - observation.ego).T) <= self.scenario.interception_metres
-            evidence = np.where(self.scenario.seen(here) | near, least, 0.0)
+            evidence = np.where(noticed(self.scenario, here, observation.ego), least, 0.0)
             self.log_evidence += math.log(float(self.weights @ np.exp(evidence)))
         self.fallbacks += bool(evidence.max() <= least)
         self._log_weight += evidence
@@ -105,7 +105,7 @@ class TrajectoryPool:
     def sample(self, count: int, ticks: int, rng: np.random.Generator) -> SampledPaths:
         weight = self.weights
         done = (self.completed_tick >= 0) & (self.completed_tick <= self._tick)
-        if not done.all():
+        if self.scenario.ego_task == "interception" and not done.all():
             weight = np.where(done, 0.0, weight)
         chosen = rng.choice(len(weight), size=count, p=weight / weight.sum())
         index = np.minimum(self._tick + np.arange(ticks + 1), self.positions.shape[1] - 1)

@@ -19,6 +19,7 @@ from tab_marl.mission.model import Constraint, Mission, Place
 from tab_marl.planning.models import walk_kernels as kernels
 from tab_marl.planning.models.interface import SampledPaths, TickObservation
 from tab_marl.planning.models.mission_map import MissionMap
+from tab_marl.planning.models.sight import noticed
 from tab_marl.world.grid import GridMap
 from tab_marl.world.regions import sample_in
 from tab_marl.world.scenario import Scenario
@@ -225,8 +226,7 @@ class ShortestPath:
             evidence = -(squared - squared.min()) / (2 * self.options.sight_metres**2)
             surprise = squared.min() > (4 * self.options.sight_metres) ** 2
         else:
-            near = np.hypot(*(here - observation.ego).T) <= self.scenario.interception_metres
-            contradicted = self.scenario.seen(here) | near
+            contradicted = noticed(self.scenario, here, observation.ego)
             evidence = np.where(contradicted, least, 0.0)
             self.log_evidence += math.log(float(self._weights() @ np.exp(evidence)))
             surprise = contradicted.all()
@@ -244,7 +244,7 @@ class ShortestPath:
         paths, now = self._paths, self._index()
         weight = self._weights()
         done = (paths.completed >= 0) & (paths.completed <= now)
-        if not done.all():
+        if self.scenario.ego_task == "interception" and not done.all():
             weight = np.where(done, 0.0, weight)
         chosen = rng.choice(len(weight), size=count, p=weight / weight.sum())
         columns = np.minimum(now + np.arange(ticks + 1), paths.positions.shape[1] - 1)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from tab_marl.planning.models import walk_kernels as kernels
 from tab_marl.planning.models.interface import SampledPaths, Sighting, TickObservation
 from tab_marl.planning.models.mission_map import MissionMap
+from tab_marl.planning.models.sight import noticed
 from tab_marl.world.grid import GridMap
 from tab_marl.world.regions import sample_in
 
@@ -127,7 +128,7 @@ class Walker:
         self._remember(observation)
 
     def sample(self, count: int, ticks: int, rng: np.random.Generator) -> SampledPaths:
-        live = np.flatnonzero(self._location != -1)
+        live = np.flatnonzero((self._location != -1) | (self.map.scenario.ego_task != "interception"))
         chosen = rng.choice(live if len(live) else len(self._xy), size=count)
         kept = self._xy, self._location, self._clocks
         self._xy, self._location, self._clocks = (array[chosen] for array in kept)
@@ -162,8 +163,7 @@ class Walker:
 
     def _forget_contradicted(self, observation: TickObservation, rng: np.random.Generator) -> None:
         """Drop particles in a camera disc (it would have been seen) or within reach of the ego (it would be over)."""
-        gap = np.hypot(*(self._xy - observation.ego).T)
-        possible = ~self.map.scenario.seen(self._xy) & (gap > self.map.scenario.interception_metres)
+        possible = ~noticed(self.map.scenario, self._xy, observation.ego)
         weight = possible.astype(np.float64)
         self.log_evidence += math.log(max(float(possible.mean()), GONE_SHARE))
         if possible.mean() < GONE_SHARE:

@@ -19,8 +19,9 @@ from tab_marl.planning.models.interface import SampledPaths
 from tab_marl.planning.pomcp import Plan, Pomcp, PomcpOptions
 from tab_marl.planning.pursuit import decide_kernels, interception_kernels
 from tab_marl.planning.pursuit.interception import RouteValues
-from tab_marl.planning.pursuit.itineraries import Geometry, Pose, PursuitOptions, geometry_of, shortlist, weighed
+from tab_marl.planning.pursuit.itineraries import Geometry, Pose, PursuitOptions, geometry_of, shortlist
 from tab_marl.planning.pursuit.routes import Itinerary, RouteMap
+from tab_marl.planning.pursuit.tasks import weighed
 from tab_marl.world.scenario import Scenario
 
 TRIED_SHARE = 0.3
@@ -100,7 +101,7 @@ def pursuit_model(
 ) -> CompiledModel:
     """The pursuit from a pose on, over these itineraries, worth `values` when followed without a change of mind."""
     scenario, step = routes.scenario, routes.scenario.step_seconds
-    rewards = weighed(scenario.rewards, options)
+    rewards = weighed(scenario.rewards, options.completion_weight)
     paths = np.ascontiguousarray(sampled.positions, dtype=np.float64)
     closing = interception_kernels.largest_step(paths) + scenario.ego.max_speed * step + 1e-6
     radius = scenario.interception_metres * options.radius_share
@@ -148,11 +149,14 @@ def decide(
     options: PursuitOptions,
     rng: np.random.Generator,
 ) -> Decision:
-    """Choose from (x, y, theta) against sampled adversary paths; `current` is what is being followed, seen from now."""
+    """Choose from (x, y, theta) against sampled adversary paths; `current` is what is being followed, seen from now.
+
+    The tree is about interception: in the other ego tasks the itinerary of best value is taken, at every decision anew.
+    """
     began = time.thread_time()
     found = shortlist(routes, pose, sampled, current, options)
     valued = time.thread_time()
-    if options.method == "routes":
+    if options.method == "routes" or routes.scenario.ego_task != "interception":
         best = int(np.argmax(found.values.mean + found.bonus))
         return Decision(found.itineraries[best], found.itineraries, found.values, None, valued - began)
     model = pursuit_model(routes, pose, sampled, found.values, found.itineraries, options)

@@ -7,7 +7,7 @@ two legs, a route and the tick at which to change to another one.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from tab_marl.planning.models.interface import SampledPaths
 from tab_marl.planning.pursuit import interception_kernels
 from tab_marl.planning.pursuit.decide_kernels import TURN_TICKS
-from tab_marl.planning.pursuit.interception import RouteValues, value_routes
+from tab_marl.planning.pursuit.interception import RouteValues
 from tab_marl.planning.pursuit.routes import Itinerary, RouteMap, RouteTable
-from tab_marl.world.scenario import Rewards
+from tab_marl.planning.pursuit.tasks import driven_detours, value_itineraries, weighed
 
 Pose = tuple[float, float, float]
 
@@ -178,10 +178,11 @@ def shortlist(
 ) -> Shortlist:
     """The best itineraries from (x, y, theta) against sampled paths; `current` (as seen from now) is always among them."""
     scenario, ticks = routes.scenario, sampled.positions.shape[1] - 1
+    rewards = weighed(scenario.rewards, options.completion_weight)
     radius = scenario.interception_metres * options.radius_share
 
     def value(table: RouteTable, paths: SampledPaths) -> RouteValues:
-        return value_routes(table, paths.positions, paths.completed_tick, weighed(scenario.rewards, options), radius)
+        return value_itineraries(table, paths, scenario, rewards, radius)
 
     table = routes.table(pose, ticks)
     rows = np.arange(routes.stay + 1)
@@ -189,7 +190,15 @@ def shortlist(
         rough = value(table, first_paths(sampled, options.screening_paths))
         rows = np.array(covering(rough.returns, rough.mean, options.screened))
     plain = value(RouteTable(table.positions[rows], table.effort[rows]), sampled)
-    itineraries = best_detours(routes, table, rows, plain, sampled, options)
+    if scenario.ego_task == "interception":
+        itineraries = best_detours(routes, table, rows, plain, sampled, options)
+    else:
+        few = first_paths(sampled, options.detour_paths)
+        firsts, ends = options.detours, options.detour_ends if options.detours else 0
+        switch = [n for n in (round(s / scenario.step_seconds) for s in options.detour_seconds) if 0 < n < ticks]
+        itineraries = driven_detours(
+            routes, pose, rows, plain, few, rewards, radius, switch, firsts, ends, options.candidates
+        )
     if current is not None:
         itineraries.insert(0, current)
     found = plain
@@ -204,11 +213,6 @@ def shortlist(
     chosen = covering(found.returns, found.mean + bonus, options.candidates, kept)
     values = RouteValues(found.returns[chosen], found.met[chosen])
     return Shortlist(tuple(itineraries[i] for i in chosen), values, bonus[chosen])
-
-
-def weighed(rewards: Rewards, options: PursuitOptions) -> Rewards:
-    """The rewards that are planned with."""
-    return replace(rewards, mission_completed=options.completion_weight * rewards.mission_completed)
 
 
 def first_paths(sampled: SampledPaths, count: int) -> SampledPaths:
@@ -259,7 +263,7 @@ def best_detours(
     hope = np.max([np.maximum(returns, returns[e]).mean(axis=1) for e in ends], axis=0)
     first = np.argsort(-hope, kind="stable")[: options.detours].astype(np.int64)
     found = np.empty((len(first), len(switch), len(ends)))
-    rewards = weighed(scenario.rewards, options)
+    rewards = weighed(scenario.rewards, options.completion_weight)
     interception_kernels.detour_returns(
         table.positions[rows[first]], returns[first], met[first], few.positions, few.completed_tick, switch, rows[ends],
         *geometry_of(routes), TURN_TICKS, scenario.ego.max_speed * scenario.step_seconds,

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tab_marl.planning.models.interface import AdversaryModel, SampledPaths, TickObservation
+from tab_marl.planning.models.sight import noticed
 from tab_marl.world.scenario import Scenario
 
 SPARE_TICKS = 20
@@ -48,9 +49,9 @@ class ScenarioSet:
             self._positions, self._completed = np.empty((0, 1, 2)), np.empty(0, dtype=np.int32)
             return
         here = self._positions[:, 1]
-        keep = ~self.scenario.seen(here)
-        keep &= np.hypot(*(here - observation.ego).T) > self.scenario.interception_metres
-        keep &= (self._completed < 0) | (self._completed > 1)
+        keep = ~noticed(self.scenario, here, observation.ego)
+        if self.scenario.ego_task == "interception":
+            keep &= (self._completed < 0) | (self._completed > 1)
         self._positions = self._positions[keep, 1:]
         self._completed = np.where(self._completed[keep] > 0, self._completed[keep] - 1, -1).astype(np.int32)
 
