@@ -1,6 +1,7 @@
 """Online POMDP planning for any generative model, and the models that make it an interceptor.
 
-`Pomcp`, `Despot` and `Pomcpow` plan; `CompiledModel`, `ContinuousModel`, `table_model` and `PythonModel` (see `tab_marl.planning.model`) say in what.
+`Pomcp`, `Despot` and `Pomcpow` plan; `CompiledModel`, `ContinuousModel`, `table_model` and `PythonModel` (see
+`tab_marl.planning.model`) say in what. docs/planning/engine.md tells how it fits together.
 """
 
 from __future__ import annotations
