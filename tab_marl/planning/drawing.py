@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tab_marl.planning.explanation import NameOf
+from tab_marl.planning.explanation import NameOf, brief
 from tab_marl.planning.tree import ROOT
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def draw_plan(
     actions: int = 4,
     observations: int = 3,
     least_share: float = 0.02,
-    name_of: NameOf = str,
+    name_of: NameOf = brief,
 ) -> Figure:
     """The plan's tree from left to right, `steps` actions deep; written to `path` (.svg, .png, .pdf) if given.
 

@@ -106,8 +106,8 @@ class ExactFilter:
 
     def _chance(self, action: int, observation: int) -> NDArray[np.float64]:
         """``[S]``: the probability of the observation in each state reached."""
-        column = self._observation[action][:, [observation]]
-        return np.asarray(column.toarray() if scipy.sparse.issparse(column) else column).ravel()
+        column: Any = self._observation[action][:, [observation]]
+        return np.asarray(column.toarray() if hasattr(column, "toarray") else column, dtype=np.float64).ravel()
 
     def _recover(self, action: int, observation: int) -> None:
         replayed = self._replayed()

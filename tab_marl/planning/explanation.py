@@ -27,6 +27,15 @@ _DRAWN = 2000
 """States drawn from a belief that is only a sampler."""
 
 
+def brief(observation: Any) -> str:
+    """An observation as text, its numbers to three digits."""
+    if isinstance(observation, float):
+        return f"{observation:.3g}"
+    if isinstance(observation, tuple | np.ndarray):
+        return f"({', '.join(brief(part) for part in observation)})"
+    return str(observation)
+
+
 @dataclass(frozen=True)
 class ActionValue:
     """What the search found out about one action at the root."""
@@ -86,7 +95,7 @@ class Explanation:
     """Steps of the longest simulation inside the tree."""
     nodes: int
     seconds: float
-    name_of: NameOf = str
+    name_of: NameOf = brief
 
     @property
     def lead(self) -> float:
@@ -141,7 +150,7 @@ class Explanation:
         return lines
 
 
-def explain(plan: Plan, belief: Any = None, name_of: NameOf = str) -> Explanation:
+def explain(plan: Plan, belief: Any = None, name_of: NameOf = brief) -> Explanation:
     """Explains a plan; `belief` is what it was made from (states, `Particles`, a filter or a sampler), `name_of` writes observations."""
     total = max(1, int(plan.visits.sum()))
     tried = [a for a in range(len(plan.names)) if plan.visits[a] > 0]
@@ -198,7 +207,7 @@ def summarise(belief: Any) -> BeliefSummary:
         return BeliefSummary(int((shares > 0).sum()), _entropy(shares), ())
     rows = states.reshape(len(states), -1)
     _, which = np.unique(rows, axis=0, return_inverse=True)
-    shares = np.bincount(which.ravel(), weights=w)
+    shares = np.bincount(which.ravel(), weights=w).astype(np.float64)
     mean = np.average(rows, axis=0, weights=w)
     spread = np.sqrt(np.average((rows - mean) ** 2, axis=0, weights=w))
     return BeliefSummary(int((shares > 0).sum()), _entropy(shares), tuple(float(s) for s in spread))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tab_marl.planning.explanation import Explanation, explain
+from tab_marl.planning.explanation import Explanation, brief, explain
 from tab_marl.planning.model import action_names
 from tab_marl.planning.tree import ROOT, SearchTree
 
@@ -55,7 +55,7 @@ class Plan:
         """Actions with value, visits and share of simulations, best first, as text."""
         return self.explain().table()
 
-    def explain(self, belief: Any = None, name_of: Callable[[Any], str] = str) -> Explanation:
+    def explain(self, belief: Any = None, name_of: Callable[[Any], str] = brief) -> Explanation:
         """Why: values, visits, lead, most likely line, size of the search, and how uncertain `belief` is; print the result.
 
         `belief` is what the plan was made from (states, `Particles`, a filter or a sampler), `name_of` writes observations.
