@@ -89,7 +89,11 @@ def simple_tag() -> Step:
     return step
 
 
-def parallel(scenario: Scenario, actions: np.ndarray, mission: str = "M1") -> Step:
+UNDER_WAY = "Reach Checkpoint A within 59s"
+"""A mission that is neither completed nor failed while the robots circle."""
+
+
+def parallel(scenario: Scenario, actions: np.ndarray, mission: str = UNDER_WAY) -> Step:
     """Both agents act; `actions` ``[STEPS, 2, 2]``."""
     env = InterceptEnv(mission=mission, scenario=scenario)
     options = {"ego_start": STARTS[0], "adversary_start": STARTS[1]}
@@ -127,6 +131,7 @@ def main() -> None:
             "bare pymunk loop": lambda: bare_pymunk(plain),
             "MPE2 simple_tag, 1 against 1": simple_tag,
             "parallel env": lambda: parallel(plain, circles),
+            "parallel env, mission over": lambda: parallel(plain, circles, "M1"),
             "parallel env, mission M5": lambda: parallel(plain, circles, "M5"),
             "parallel env, random actions": lambda: parallel(plain, random),
             "parallel env, 12 lidar rays": lambda: parallel(lidar, circles),

@@ -30,7 +30,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -234,6 +236,25 @@ class AdversaryObserver:
         self._memory = np.zeros(2, dtype=np.int32)
         self._clocks = np.zeros(3, dtype=np.int32)
         self._out = np.zeros(OBSERVED, dtype=np.float32)
+        self._look_up()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "_kernel"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Compiled code does not travel."""
+        self.__dict__.update(state)
+        self._look_up()
+
+    def _look_up(self) -> None:
+        """The compiled version for these tables: numba's dispatcher would find it anew at every call, from 33 arrays."""
+        self._kernel: Any = kernels.observe
+        arguments = (
+            self.task.tables, 0, 0.0, 0.0, 0.0, 0.0, 0.0, -1, self._clocks, self._memory, False, 0.0, 0.0, self._out,
+        )  # fmt: skip
+        if hasattr(kernels.observe, "get_overload"):  # not where numba is switched off
+            kernels.observe(*arguments)
+            self._kernel = kernels.observe.get_overload(tuple(numba.typeof(argument) for argument in arguments))
 
     def reset(self) -> None:
         """Begin a new episode on the same task."""
@@ -266,7 +287,7 @@ class AdversaryObserver:
             return np.zeros(OBSERVED, dtype=np.float32)
         self._clocks[:] = clocks
         ego_x, ego_y = ego or (0.0, 0.0)
-        kernels.observe(
+        self._kernel(
             self.task.tables, 0, x, y, theta, v, w, location, self._clocks, self._memory, ego is not None, ego_x, ego_y,
             self._out,
         )  # fmt: skip

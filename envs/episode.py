@@ -124,17 +124,22 @@ class Episode:
 
     def mission_progress(self) -> tuple[int, int]:
         """(goals completed, visits counted for the current one); stays where it was when the mission failed."""
-        location, automaton = self.monitor.location, self.monitor.automaton
-        if location >= 0:
-            self._stage = (int(automaton.goals_done[location]), int(automaton.visits[location]))
+        if self.monitor.location >= 0:
+            self._keep_stage(self.monitor.location)
         return self._stage
+
+    def _keep_stage(self, location: int) -> None:
+        automaton = self.monitor.automaton
+        self._stage = (int(automaton.goals_done[location]), int(automaton.visits[location]))
 
     def _watch_mission(self) -> str:
         motion = self.motion[ADVERSARY]
-        self.mission_progress()  # kept for the picture of a mission that fails now
+        before = self.monitor.location
         status = self.monitor.step((motion.x, motion.y), motion.v)
         if status == "completed":
             self.completed_seconds = self.seconds
+        if status != "active":
+            self._keep_stage(before)  # for the picture of a mission that fails now
         return status
 
     def _sense(self) -> None:
