@@ -272,7 +272,7 @@ def test_plain_python_models_are_filtered_too():
 
 def test_a_filter_without_trouble_is_silent_and_repeatable():
     with warnings.catch_warnings():
-        warnings.simplefilter("error")
+        warnings.simplefilter("error", BeliefWarning)
         beliefs = [ParticleFilter(textbook.tiger(), [0.0, 1.0], rng=7) for _ in range(2)]
         for belief in beliefs:
             belief.update(0, 0).update(0, 1).update(0, 0)
