@@ -70,7 +70,7 @@ def look_ahead_planes(q, first, last, stencil, labels, delta, factor, possible, 
 
 @njit(cache=True)
 def mixed_planes(motion, r, inside, first, last, moved, redrawn, planes):
-    """The redrawing of the mode, at the points that are `inside` (0 or 1); returns the largest result.
+    """The redrawing of the mode, times `inside`; returns the largest result.
 
     ``planes[m, x] = inside[x] sum_m' mix[r, m, m'] moved[m', x]`` for first <= x < last.
     """
@@ -120,7 +120,7 @@ def expect_planes(motion, stencil, r, needed, planes, inside, moved, redrawn):
     first, last = stencil.position[begin], stencil.position[end - 1] + 1
     inside[first:last] = 0.0
     for cell in range(begin, end):
-        inside[stencil.position[cell]] = needed[cell]
+        inside[stencil.position[cell]] = needed[cell] * stencil.scale[r, cell]
     for m in range(planes.shape[0]):
         shifted_sum(planes[m], stencil.shift[r, m], stencil.share[r, m], first, last, moved[m])
     return mixed_planes(motion, r, inside, first, last, moved, redrawn, planes)

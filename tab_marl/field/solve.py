@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from typing import Literal
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -21,8 +24,10 @@ from tab_marl.field.stencil import Stencil, no_stencil, stencil_of
 from tab_marl.field.support import Support, support_of
 from tab_marl.field.tab_field import TabField, expected_transitions, start_log_partition
 from tab_marl.field.tables import zeros
+from tab_marl.world.scenario import UnknownName
 
 Floats = NDArray[np.float64]
+Message = Callable[[FieldProblem, Tilt], ProductChain]
 
 # Rows of messages are scaled to these maxima, to use the whole range of the number format: 68 and 600 decades below.
 # Powers of 2, so that scaling rounds nothing.
@@ -33,51 +38,70 @@ SAMPLED_PATHS = 2000
 """Trajectories that show how visits go together; their sampling error only slows the fit."""
 
 
-def solve(problem: FieldProblem) -> TabField:
+def solve(problem: FieldProblem, backend: Literal["numba", "torch"] = "numba", device: str = "cpu") -> TabField:
     """The maximum-entropy distribution over trajectories that complete the mission (paper, eq. 1).
 
-    Exact on the product of cells and mission automaton (design, section 4). Raises InfeasibleField, and FieldTooLarge beyond
-    `FieldOptions.memory_gigabytes`.
+    Exact on the product of cells and mission automaton (design, section 4).
+
+    Args:
+        backend: of the backward passes; `torch` needs PyTorch and gives the same numbers.
+        device: where `torch` computes, for instance "cuda"; it must know double precision.
+    Raises:
+        InfeasibleField: no trajectory completes the mission.
+        FieldTooLarge: more memory than `FieldOptions.memory_gigabytes` is needed.
+        ValueError: the backend or the device is not known or not there.
     """
+    compute: Message = message
+    if backend == "torch":
+        from tab_marl.field import torch_backend
+
+        torch_backend.check(device)
+        compute = partial(message, torch_device=device)
+    elif backend != "numba":
+        raise UnknownName("backend", str(backend), ("numba", "torch"))
+    elif device != "cpu":
+        raise ValueError(
+            f'device is {device!r}: compiled code runs on "cpu" only; for another device use backend="torch"'
+        )
     try:
-        return _solve(problem)
+        return _solve(problem, compute)
     except InfeasibleField:
         if problem.options.precision == "double":
             raise
         # A start more than 68 decades less likely to complete than the best state: single precision cannot hold it.
-        return _solve(replace(problem, options=replace(problem.options, precision="double")))
+        return _solve(replace(problem, options=replace(problem.options, precision="double")), compute)
 
 
-def _solve(problem: FieldProblem) -> TabField:
+def _solve(problem: FieldProblem, compute: Message) -> TabField:
     refuse_beyond_memory(problem)
     if problem.constraints:
         from tab_marl.field.dual import fit_soft
 
-        chain, tilt, flux, report = fit_soft(problem, message)
+        chain, tilt, flux, report = fit_soft(problem, compute)
         return TabField(problem, chain, tilt, flux, report.worst, report.passes, report)
     tilt = Tilt.of(problem)
     if not tilt.needed:
-        return TabField(problem, message(problem, tilt), tilt, None, 0.0, 1)
+        return TabField(problem, compute(problem, tilt), tilt, None, 0.0, 1)
     history: History | None = None
     if problem.rough is not None and not problem.options.timing_prior and not tilt.scaling_is_exact:
         rough = Tilt.of(problem.rough)
         try:
-            _, _, _, history, _ = _fitted(problem.rough, rough, None)
+            _, _, _, history, _ = _fitted(problem.rough, rough, None, compute)
             tilt.start_from(rough)
         except InfeasibleField:  # rough cells may close a gap
             history = None
-    flux, error, rounds, _, chain = _fitted(problem, tilt, history)
+    flux, error, rounds, _, chain = _fitted(problem, tilt, history, compute)
     return TabField(problem, chain, tilt, flux, error, rounds)
 
 
 def _fitted(
-    problem: FieldProblem, tilt: Tilt, history: History | None
+    problem: FieldProblem, tilt: Tilt, history: History | None, compute: Message
 ) -> tuple[Floats, float, int, History, ProductChain]:
     latest: list[ProductChain] = []
 
     def pass_both_ways(current: Tilt) -> Floats:
         latest.clear()  # two tables at a time would take twice the memory
-        latest.append(message(problem, current))
+        latest.append(compute(problem, current))
         return expected_transitions(latest[0], problem.automaton.rank)
 
     def sample_visits() -> Floats:
@@ -115,12 +139,11 @@ def layout(problem: FieldProblem, failing: bool) -> tuple[Support, Stencil]:
     return known[failing]
 
 
-def message(problem: FieldProblem, tilt: Tilt) -> ProductChain:
-    """The chain of the backward messages under these weights."""
+def message(problem: FieldProblem, tilt: Tilt, torch_device: str | None = None) -> ProductChain:
+    """The chain of the backward messages under these weights; computed by PyTorch where a device of its is named."""
     automaton, motion = problem.automaton, problem.reference
     count, states = len(automaton.delta), motion.states
     single = problem.options.precision == "single"
-    support, stencil = layout(problem, bool(np.isfinite(tilt.log_failure)))
     value = zeros((count, states), np.float32 if single else np.float64)
     peak = PEAK[problem.options.precision]
     log_scale = np.zeros(count)
@@ -140,10 +163,16 @@ def message(problem: FieldProblem, tilt: Tilt) -> ProductChain:
             peak, value, norm, log_scale,
         )  # fmt: skip
         order = order[~over]
-    backward_kernels.backward(
-        order, motion.motion, stencil, problem.reference_of, problem.labels, automaton.delta, weight,
-        peak, *support, value, log_scale,
-    )  # fmt: skip
+    if torch_device is not None:
+        from tab_marl.field import torch_backend
+
+        torch_backend.backward(order, problem, weight, peak, value, log_scale, torch_device)
+    else:
+        support, stencil = layout(problem, bool(np.isfinite(tilt.log_failure)))
+        backward_kernels.backward(
+            order, motion.motion, stencil, problem.reference_of, problem.labels, automaton.delta, weight,
+            peak, *support, value, log_scale,
+        )  # fmt: skip
     # The initial state only reads the first label and is never left by a move; its scale is that of what follows.
     first = automaton.delta[automaton.initial, np.unique(np.asarray(problem.labels)[np.asarray(problem.start) > 0])]
     log_scale[automaton.initial] = max(log_scale[first].max(), -1e300)

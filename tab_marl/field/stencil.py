@@ -1,7 +1,7 @@
 """Moves that are the same from every cell: a shorter way to compute, found in the moves themselves.
 
-Where each mode keeps to itself and moves by fixed offsets, and only what ends in a blocked cell is lost, one tick is a few
-shifted sums over a padded lattice, and no list of moves has to be read.
+Where each mode keeps to itself and moves by fixed offsets, and what ends in a blocked cell is lost or shared out, one tick
+is a few shifted sums over a padded lattice, and no list of moves has to be read.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from tab_marl.field.reference import Reference
 
-LARGEST_WIDTH = 8
-"""Offsets per mode: a displacement rounded to the cells of a 3-D grid."""
+AGREEMENT = 1e-12
+"""Relative difference up to which two sums of the same numbers may differ by rounding."""
 
 
 class Stencil(NamedTuple):
@@ -28,57 +28,80 @@ class Stencil(NamedTuple):
     """``[R, M, W]``."""
     share: NDArray[np.float64]
     """``[R, M, W]``: probability of each shift; 0 fills up."""
+    scale: NDArray[np.float64]
+    """``[R, C]``: factor on what the shifts give, where walls take a part of a row and the rest is scaled up."""
 
 
 def no_stencil() -> Stencil:
-    return Stencil(0, np.zeros(0, dtype=np.int64), np.zeros((1, 1, 1), dtype=np.int64), np.zeros((1, 1, 1)))
+    return Stencil(
+        0, np.zeros(0, dtype=np.int64), np.zeros((1, 1, 1), dtype=np.int64), np.zeros((1, 1, 1)), np.zeros((1, 0))
+    )
 
 
-def stencil_of(reference: Reference, centres: NDArray[np.float64] | None, cell_metres: float) -> Stencil:
-    """The stencil of these moves between cells with these centres ``[C, D]``, or `no_stencil`."""
-    modes, count = reference.modes, reference.count
-    if centres is None or modes == 1:  # with one mode there is little to gain
-        return no_stencil()
+def stencil_of(reference: Reference, centres: NDArray[np.float64], cell_metres: float) -> Stencil:
+    """The stencil of these moves between cells with these centres ``[C, D]``, or `no_stencil`.
+
+    Each mode's longest row is taken for the stencil; it is one if it gives what the rows give, on random numbers.
+    """
+    modes, count, states = reference.modes, reference.count, reference.states
     lattice = np.rint((centres - centres.min(axis=0)) / cell_metres).astype(np.int64)
-    used = reference.data > 0
-    row = np.repeat(np.arange(len(reference.indptr) - 1, dtype=np.int64), np.diff(reference.indptr))[used]
-    data = reference.data[used]
-    cell, mode = np.divmod(row % reference.states, modes)
-    to_cell, to_mode = np.divmod(reference.indices[used].astype(np.int64), modes)
-    if len(row) == 0 or (mode != to_mode).any():
+    if len(reference.data) == 0:
         return no_stencil()
-    move = lattice[to_cell] - lattice[cell]
-    pad = np.abs(move).max(axis=0)
-    # The last axis of the cell numbering varies slowest: strides from the order in which the cells are numbered.
+    entries = _sums(reference, (reference.data > 0).astype(np.int32))
+    found = []
+    for r in range(count):
+        lengths = entries[r * states : (r + 1) * states].reshape(-1, modes)
+        for m in range(modes):
+            cell = int(lengths[:, m].argmax())
+            row = r * states + cell * modes + m
+            at = slice(int(reference.indptr[row]), int(reference.indptr[row + 1]))
+            used = reference.data[at] > 0
+            to_cell, to_mode = np.divmod(reference.indices[at][used], modes)
+            if (to_mode != m).any():
+                return no_stencil()
+            found.append((lattice[to_cell] - lattice[cell], reference.data[at][used]))
+    pad = np.max([np.abs(moves).max(axis=0, initial=0) for moves, _ in found], axis=0)
     extent = lattice.max(axis=0) + 1 + 2 * pad
-    order = np.argsort([np.abs(np.diff(lattice[:, d])).sum() for d in range(lattice.shape[1])])[::-1]
-    stride = np.zeros(lattice.shape[1], dtype=np.int64)
-    step = 1
-    for d in order:
-        stride[d] = step
-        step *= extent[d]
+    # The coordinate that changes most from cell to cell varies fastest on the lattice, too.
+    stride = np.zeros(len(extent), dtype=np.int64)
+    size = 1
+    for axis in np.argsort(-np.abs(np.diff(lattice, axis=0)).sum(axis=0), kind="stable"):
+        stride[axis] = size
+        size *= int(extent[axis])
     position = (lattice + pad) @ stride
     if (np.diff(position) <= 0).any():
         return no_stencil()
-    shift = move @ stride
-    kind = (row // reference.states) * modes + mode  # [nnz] which (r, m)
-    keys, first = np.unique(np.stack([kind, shift], axis=1), axis=0, return_index=True)
-    width = int(np.bincount(keys[:, 0], minlength=count * modes).max())
-    if width > LARGEST_WIDTH:
-        return no_stencil()
-    shifts, shares = np.zeros((count * modes, width), dtype=np.int64), np.zeros((count * modes, width))
-    column = np.arange(len(keys)) - np.searchsorted(keys[:, 0], keys[:, 0])
-    shifts[keys[:, 0], column], shares[keys[:, 0], column] = keys[:, 1], data[first]
-    free = np.zeros(step, dtype=bool)
-    free[position] = True
-    expected = sum(int(free[position + s].sum()) for s in keys[:, 1])
-    same = np.searchsorted(_code(keys[:, 0], keys[:, 1], step), _code(kind, shift, step))
-    if expected != len(row) or not np.allclose(data, data[first][same], rtol=1e-12, atol=0):
-        return no_stencil()
-    shape = (count, modes, width)
-    return Stencil(int(step), position, shifts.reshape(shape), shares.reshape(shape))
+    width = max(len(shares) for _, shares in found)
+    shift, share = np.zeros((count, modes, width), dtype=np.int64), np.zeros((count, modes, width))
+    for i, (moves, shares) in enumerate(found):
+        shift.reshape(-1, width)[i, : len(shares)] = moves @ stride
+        share.reshape(-1, width)[i, : len(shares)] = shares
+    stencil = Stencil(size, position, shift, share, np.ones((count, len(lattice))))
+    if modes == 1:
+        kept = _applied(stencil, np.ones(states))
+        all_kept = _sums(reference, reference.data).reshape(count, states)
+        stencil.scale[:] = np.divide(all_kept, kept, out=np.zeros_like(kept), where=kept > 0)
+    numbers = np.random.default_rng(0).random(states) + 0.5
+    rows = _sums(reference, reference.data * numbers[reference.indices]).reshape(count, states)
+    return stencil if np.allclose(_applied(stencil, numbers), rows, rtol=AGREEMENT, atol=0) else no_stencil()
 
 
-def _code(kind: NDArray[np.int64], shift: NDArray[np.int64], size: int) -> NDArray[np.int64]:
-    """One number per (kind, shift), rising as rows of the two do."""
-    return kind * (2 * size + 1) + shift + size
+def _applied(stencil: Stencil, ahead: NDArray[np.float64]) -> NDArray[np.float64]:
+    """``[R, S]``: what the moves make of ``ahead[S]``, by shifts."""
+    count, modes, width = stencil.shift.shape
+    out = np.zeros((count, len(stencil.position), modes))
+    for m in range(modes):
+        plane = np.zeros(stencil.size)
+        plane[stencil.position] = ahead.reshape(-1, modes)[:, m]
+        for r in range(count):
+            for k in range(width):
+                if stencil.share[r, m, k] > 0:
+                    out[r, :, m] += stencil.share[r, m, k] * plane[stencil.position + stencil.shift[r, m, k]]
+            out[r, :, m] *= stencil.scale[r]
+    return out.reshape(count, -1)
+
+
+def _sums(reference: Reference, entries: NDArray[np.generic]) -> NDArray[np.float64]:
+    """``[R * S]``: sums over rows of one number per entry."""
+    sums = np.add.reduceat(np.append(entries, np.zeros(1, entries.dtype)), reference.indptr[:-1])
+    return np.asarray(np.where(np.diff(reference.indptr) > 0, sums, 0))
