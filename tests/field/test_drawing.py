@@ -23,9 +23,9 @@ TWO_STAGES = Mission(
 def field(tmp_path_factory):
     from tab_marl.world.scenario import Scenario
 
-    mission = Mission((Constraint("deadline", ("Checkpoint C",), seconds=12),))
+    mission = Mission((Constraint("deadline", ("Checkpoint C",), seconds=8),))
     options = FieldOptions(reference="walk", cell_metres=0.25)
-    return solve(FieldProblem.from_mission(mission, Scenario.preset("open"), options, horizon_ticks=30))
+    return solve(FieldProblem.from_mission(mission, Scenario.preset("open"), options, horizon_ticks=20))
 
 
 def test_picture_has_panels_paths_and_stage_times(field, tmp_path):
