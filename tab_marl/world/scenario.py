@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import ClassVar, Literal, get_args
 
 import numpy as np
@@ -286,13 +287,18 @@ class Scenario:
             table[alias.casefold()] = table[name.casefold()]
         return table
 
+    @cached_property
+    def _region_of(self) -> dict[str, Region]:
+        """Every accepted spelling (case-folded) -> its region; tables of names are slow to build, and asked for often."""
+        regions = dict(self.named_regions())
+        return {spelling: regions[name] for spelling, name in self.spellings().items()}
+
     def region(self, name: str) -> Region:
         """The region of this name or alias, any case. Raises UnknownName."""
-        spellings = self.spellings()
-        canonical = spellings.get(name.casefold())
-        if canonical is None:
-            raise UnknownName("region", name, spellings.values())
-        return dict(self.named_regions())[canonical]
+        found = self._region_of.get(name.casefold())
+        if found is None:
+            raise UnknownName("region", name, self.spellings().values())
+        return found
 
     def place(self, place: str | tuple[float, float]) -> Region:
         """The region of a name, or the goal disc around a bare target point."""
