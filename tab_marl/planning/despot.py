@@ -184,7 +184,8 @@ def drawn_scenarios(
 
 def powers_of(options: DespotOptions) -> NDArray[np.float64]:
     """``[horizon + 1]`` discount^depth."""
-    return np.cumprod([1.0, *[options.discount] * options.horizon])
+    powers = np.cumprod([1.0, *[options.discount] * options.horizon])
+    return powers.astype(np.float64)
 
 
 def _search_compiled(

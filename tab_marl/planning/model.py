@@ -39,7 +39,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any, Protocol, TypeAlias
 
 import numba
@@ -101,7 +101,7 @@ class CompiledModel:
     @cached_property
     def upper_function(self) -> Any:
         """`upper` compiled for this type of data, or None."""
-        if self.upper is None or getattr(numba.config, "DISABLE_JIT", 0):
+        if self.upper is None or getattr(numba.config, "DISABLE_JIT", False):
             return self.upper
         signature = types.float64(_STATE, types.int64, types.int64, types.float64, typeof(self.data))
         return callback(_plain(self.upper), signature)
@@ -181,14 +181,19 @@ class PlainPythonWarning(UserWarning):
     """A model is searched in plain Python."""
 
 
-@cache
+_said_slow: set[type] = set()
+
+
 def warn_of_plain_python(kind: type) -> None:
     """Says once per class of model that it is slow, and what to do."""
+    if kind in _said_slow:
+        return
+    _said_slow.add(kind)
     warnings.warn(
         f"{kind.__name__} is a model in plain Python: every step is interpreted, a hundred to a thousand times slower than "
         "compiled. Once it is right, write its step as a function for CompiledModel, or give table_model its tables",
         PlainPythonWarning,
-        stacklevel=4,
+        stacklevel=3,
     )
 
 

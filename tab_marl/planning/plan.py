@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -107,19 +108,20 @@ def decided(search: Search, model: Any, choose: Literal["value", "visits"], seco
     tree, actions = search.tree, model.actions
     values = np.full(actions, -np.inf)
     visits = np.zeros(actions, dtype=np.int64)
-    at_root = tree.edges[: tree.nodes["edge_count"][ROOT]]
-    chosen = tree.edge_actions[: len(at_root)]
-    visits[chosen] = at_root["visits"]
-    values[chosen] = np.where(at_root["visits"] > 0, at_root["value"], -np.inf)
-    broken = (visits > 0) & ~np.isfinite(values)
-    if broken.any():
-        action = int(np.argmax(broken))
-        raise ValueError(
-            f"action {action} has value {values[action]}: the model's rewards or rollouts are not all finite"
-        )
-    keys = (values, visits) if choose == "value" else (visits, values)
-    best = np.flatnonzero(keys[0] == keys[0].max())
-    action = int(best[np.argmax(keys[1][best])])
+    count = int(tree.nodes["edge_count"][ROOT])
+    numbers, returns = tree.edge_actions[:count].tolist(), tree.edges["value"][:count].tolist()
+    best: tuple[tuple[float, float], int] | None = None
+    for number, value, tried in zip(numbers, returns, tree.edges["visits"][:count].tolist(), strict=True):
+        if tried > 0:
+            if not math.isfinite(value):
+                raise ValueError(
+                    f"action {number} has value {value}: the model's rewards or rollouts are not all finite"
+                )
+            values[number], visits[number] = value, tried
+        key = ((value if tried else -math.inf), tried) if choose == "value" else (tried, value if tried else -math.inf)
+        if best is None or key > best[0]:
+            best = key, number
+    action = numbers[0] if best is None else best[1]
     return Plan(
         action, values, visits, search.simulations, search.depth, search.steps, seconds, tree, action_names(model),
         search.stopped, search.full, search.bounds,

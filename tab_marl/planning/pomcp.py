@@ -132,7 +132,7 @@ class Pomcp:
             warn_of_plain_python(type(self.model))
             grow = grow_tree_in_python
         else:
-            interpreted = not self.options.compiled or getattr(numba.config, "DISABLE_JIT", 0)
+            interpreted = not self.options.compiled or bool(getattr(numba.config, "DISABLE_JIT", 0))
             grow = grow_tree_in_python if interpreted else grow_tree_compiled
         search = grow(self.model, self.options, belief, generator, start)
         return decided(search, self.model, self.options.choose, time.perf_counter() - started)

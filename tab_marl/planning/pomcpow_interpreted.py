@@ -15,7 +15,7 @@ from tab_marl.planning.growing import merged, particle_blocks, shares
 from tab_marl.planning.interpreted import Stream, mixed
 from tab_marl.planning.kernels import NO_CHILD, UNEXPANDED
 from tab_marl.planning.model import ContinuousModel, Particles, belief_states, check_weights
-from tab_marl.planning.plan import Search
+from tab_marl.planning.plan import Search, Stopped
 from tab_marl.planning.pomcpow_kernels import FIRST_ROOM
 from tab_marl.planning.tree import EDGE, NODE, ROOT, SearchTree
 
@@ -242,7 +242,7 @@ def search_in_python(
         tree = search.tree()
         tree.nodes["observation"] += len(seen)
         seen += [node.seen for node in search.nodes]
-        stopped = "seconds" if timed_out else "simulations"
+        stopped: Stopped = "seconds" if timed_out else "simulations"
         searches.append(Search(tree, done, search.deepest, search.steps, stopped, len(tree) >= node_cap))
     whole = merged(searches, start, options.max_nodes)
     flat = [s[0] if isinstance(s, tuple) and len(s) == 1 else s for s in seen]

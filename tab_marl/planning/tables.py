@@ -183,7 +183,8 @@ def _sparse_model(
         entries = flat[before, 0] if r.ndim == 2 else flat[before, rows.number]
     ends = _terminal(terminal, states)
     probabilities = scipy.sparse.csr_array(scipy.sparse.vstack(t))
-    mean = np.bincount(before, probabilities.data * entries, minlength=actions * states).reshape(actions, states)
+    totals = np.bincount(before, probabilities.data * entries, minlength=actions * states).astype(np.float64)
+    mean = totals.reshape(actions, states)
     data = SparseData(rows, seen, np.ascontiguousarray(entries), ends, _known_state_values(t, mean, ends, discount))
     return _bounded(CompiledModel(table_kernels.sparse_step, actions, 1, data, action_names=action_names), discount)
 
