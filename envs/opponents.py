@@ -82,7 +82,7 @@ class Random:
         return self._action
 
 
-def follow_route(observation: NDArray[np.float32], turn_per_step: float) -> Action:
+def follow_route(observation: NDArray[np.float32], turn_per_step: float | NDArray[np.float64]) -> Action:
     """Turn towards the observed route and drive along it; wait where that would be too early.
 
     `observation`: ``[D]`` or ``[N, D]`` of the adversary; `turn_per_step`: largest turn in one control step, rad.
