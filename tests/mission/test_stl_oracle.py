@@ -215,7 +215,7 @@ def library_verdict(mission: Mission, points: np.ndarray) -> bool:
 def test_a_published_monitor_agrees(kind):
     rng = np.random.default_rng(KINDS.index(kind))
     verdicts = []
-    for _ in range(8):
+    for _ in range(5):
         constraints = OWN[kind](rng) if kind in OWN else random_mission(rng, kind).constraints
         mission = Mission(constraints, kind)
         formula = Formula(mission)
@@ -230,4 +230,4 @@ def test_a_published_monitor_agrees(kind):
             verdicts.append(robustness > 0)
             assert library_verdict(mission, points) == verdicts[-1], (mission, formula.text, points.tolist())
     # The trajectories must be worth something: both verdicts occur.
-    assert 3 <= sum(verdicts) <= len(verdicts) - 3
+    assert 2 <= sum(verdicts) <= len(verdicts) - 2
