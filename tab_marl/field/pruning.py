@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from tab_marl.field.infeasible import InfeasibleField
 
@@ -19,12 +20,11 @@ Bools = NDArray[np.bool_]
 
 def pruned(problem: FieldProblem) -> FieldProblem:
     """See `FieldProblem.pruned`. Raises InfeasibleField when nothing is left."""
-    from tab_marl.field.support import support_of
-
     if problem.constraints or problem.tracking is not None:
         raise ValueError("pruned() needs a problem without soft constraints: prune first, then add them")
     automaton = problem.automaton
-    possible = support_of(problem, True, problem.options.completion_probability < 1).possible
+    neighbours = _neighbours(problem)
+    possible = _completing(problem, neighbours, _visited(problem, neighbours))
     started = np.flatnonzero(np.asarray(problem.start) > 0)
     if not possible[automaton.delta[automaton.initial, np.asarray(problem.labels)[started]], started].any():
         raise InfeasibleField("no feasible motion from any start cell completes the mission: there is nothing to keep")
@@ -54,3 +54,54 @@ def restricted(automaton: TickAutomaton, kept: Bools) -> TickAutomaton:
     for name in ("initial", "accepting", "rejecting"):
         changes[name] = int(number[getattr(automaton, name)])
     return replace(automaton, **changes)
+
+
+def _neighbours(problem: FieldProblem) -> list[sparse.csr_array]:
+    """Per reference ``[C, C]``: which cells a tick can lead to, whatever the mode."""
+    motion = problem.reference
+    cells = problem.cells
+    found = []
+    for r in range(motion.count):
+        at = motion.indptr[r * motion.states : (r + 1) * motion.states + 1]
+        entries = slice(int(at[0]), int(at[-1]))
+        source = np.repeat(np.arange(motion.states) // motion.modes, np.diff(at))
+        target = motion.indices[entries] // motion.modes
+        possible = motion.data[entries] > 0
+        # In a tick any mode may be drawn before the move, so cells alone reach at least as far as (cell, mode) do.
+        pairs = (np.ones(int(possible.sum()), dtype=np.int32), (source[possible], target[possible]))
+        found.append(sparse.csr_array(sparse.coo_array(pairs, shape=(cells, cells))))
+    return found
+
+
+def _visited(problem: FieldProblem, neighbours: list[sparse.csr_array]) -> Bools:
+    """``[Q, C]``: which cells the motion can be in when the automaton enters each transient state."""
+    automaton, labels = problem.automaton, np.asarray(problem.labels)
+    which = np.asarray(problem.reference_of)
+    inside = np.zeros((len(automaton.delta), problem.cells), dtype=bool)
+    absorbing = {automaton.accepting, automaton.rejecting}
+    started = np.flatnonzero(np.asarray(problem.start) > 0)
+    inside[automaton.delta[automaton.initial, labels[started]], started] = True
+    transposed = [sparse.csr_array(matrix.T) for matrix in neighbours]
+    for q in np.argsort(automaton.rank, kind="stable"):
+        if q in absorbing or not inside[q].any():
+            continue
+        ahead = np.flatnonzero(transposed[which[q]] @ inside[q].astype(np.int32))
+        inside[automaton.delta[q, labels[ahead]], ahead] = True
+    return inside
+
+
+def _completing(problem: FieldProblem, neighbours: list[sparse.csr_array], visited: Bools) -> Bools:
+    """``[Q, C]``: visited there, and from there the motion can still lead to an end that counts."""
+    automaton, labels = problem.automaton, np.asarray(problem.labels)
+    which = np.asarray(problem.reference_of)
+    hopeful = np.zeros_like(visited)
+    hopeful[automaton.accepting] = True
+    hopeful[automaton.rejecting] = problem.options.completion_probability < 1  # then failing is an end, too
+    absorbing = {automaton.accepting, automaton.rejecting}
+    cells = np.arange(problem.cells)
+    for q in np.argsort(-automaton.rank, kind="stable"):
+        if q in absorbing or q == automaton.initial or not visited[q].any():
+            continue
+        ahead = hopeful[automaton.delta[q, labels], cells]
+        hopeful[q] = visited[q] & ((neighbours[which[q]] @ ahead.astype(np.int32)) > 0)
+    return hopeful

@@ -65,12 +65,20 @@ def test_bytes_are_those_that_solving_takes() -> None:
 
 def test_a_large_table_is_counted_by_its_pages() -> None:
     """Above `state_budget` only what the motion can reach is solved for; the estimate counts the same pages."""
-    problem = problem_on(40, 240, precision="double", state_budget=1000)
+    rings = np.tile(np.arange(12)[:, None], (1, 3))
+    rings[:, 1] = np.minimum(np.arange(12) + 1, 11)  # eleven visits to A, one tick each
+    side = 60
+    grid = GridMap.from_array(np.ones((side, side), dtype=bool))
+    labels = np.zeros(grid.cells, dtype=int)
+    labels[-1] = 1
+    problem = FieldProblem.from_arrays(
+        run_and_tumble(grid, 1.0, 8, 3.0), labels, FiniteAutomaton(rings, 0, 11), np.eye(grid.cells)[0], 120,
+        FieldOptions(precision="double", state_budget=1000), grid=grid,
+    )  # fmt: skip
     size = problem.size()
     table = 8 * size.product_states
     possible = support_of(problem, True, False).possible
-    lower = possible.sum() * 9 * 8
-    assert lower < size.memory.messages < 0.8 * table
+    assert possible.sum() * 9 * 8 < size.memory.messages < 0.9 * table
     first = np.flatnonzero(possible) * 9 * 8
     pages = np.union1d(first // 4096, (first + 9 * 8 - 1) // 4096)
     assert size.memory.messages == pytest.approx(4096 * len(pages), rel=0.15)
@@ -81,9 +89,9 @@ def test_seconds_grow_with_the_problem_and_are_about_right() -> None:
     solve(problem)
     taken = []
     for _ in range(3):
-        began = time.perf_counter()
+        began = time.thread_time()
         solve(problem)
-        taken.append(time.perf_counter() - began)
+        taken.append(time.thread_time() - began)
     # On a machine to itself within a factor of 2 (benchmarks/field_estimates.py); a busy one is less exact.
     assert 0.2 < problem.size().seconds / min(taken) < 5
 
