@@ -253,7 +253,11 @@ def search(
             used[GREW] = 0
         target = share * (nodes[0]["upper"] - nodes[0]["lower"])
         going = used[AT] == 0 or excess(nodes, node, total, target) > 0
-        if going and used[AT] > 0 and (nodes[node]["depth"] >= tree_depth or (penalty > 0 and pruned(nodes, penalty, path, used))):
+        if (
+            going
+            and used[AT] > 0
+            and (nodes[node]["depth"] >= tree_depth or (penalty > 0 and pruned(nodes, penalty, path, used)))
+        ):
             if nodes[node]["upper"] > nodes[node]["lower"]:
                 close_node(nodes, node)
                 used[GREW] = 1
