@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,7 +101,7 @@ def _on_grid(
     headed = process is None and options.reference in HEADED
     refuse_before_building(automaton, grid.cells, options.headings if headed else 1, options)
     motion, which = _motion(grid, world, options, automaton.speed_limit, process)
-    staged = {}
+    staged: dict[str, Any] = {}
     if isinstance(compiled, MissionAutomaton):
         stage, names = stages_of(compiled, automaton)
         staged = {"stage": stage, "stage_names": names}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -196,7 +196,7 @@ class FieldProblem:
             fits = cells.ndim == 1 and first.shape == cells.shape and (first > 0).any()  # else refused below
             automaton = finite.unrolled(horizon, cells, cells[first > 0] if fits else None)
             which = None if which is None else finite.of_states(which, automaton.location, "reference_of")
-        settings = {} if options is None else {"options": options}
+        settings: dict[str, Any] = {} if options is None else {"options": options}
         return cls(
             transitions, labels, automaton, start, horizon,
             reference_of=which, grid=grid, branch_places=tuple(branch_places), **settings,

@@ -28,13 +28,12 @@ def pruned(problem: FieldProblem) -> FieldProblem:
     started = np.flatnonzero(np.asarray(problem.start) > 0)
     if not possible[automaton.delta[automaton.initial, np.asarray(problem.labels)[started]], started].any():
         raise InfeasibleField("no feasible motion from any start cell completes the mission: there is nothing to keep")
-    kept = possible.any(axis=1)
+    kept = np.asarray(possible.any(axis=1))
     kept[[automaton.initial, automaton.accepting, automaton.rejecting]] = True
     rough = None if problem.rough is None else pruned(problem.rough)
-    return replace(
-        problem, automaton=restricted(automaton, kept), rough=rough,
-        **{name: np.asarray(getattr(problem, name))[kept] for name in ("reference_of", "stage", "status")},
-    )  # fmt: skip
+    of_states = {name: np.asarray(getattr(problem, name))[kept] for name in ("reference_of", "stage", "status")}
+    settings: dict[str, Any] = {"automaton": restricted(automaton, kept), "rough": rough, **of_states}
+    return replace(problem, **settings)
 
 
 def restricted(automaton: TickAutomaton, kept: Bools) -> TickAutomaton:

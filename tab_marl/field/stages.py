@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from tab_marl.mission.unroll import TickAutomaton
     from tab_marl.world.grid import GridMap
     from tab_marl.world.scenario import Scenario
+    from tab_marl.world.volume import Volume
+    from tab_marl.world.voxels import VoxelMap
 
 
 def stages_of(compiled: MissionAutomaton, automaton: TickAutomaton) -> tuple[NDArray[np.int32], tuple[str, ...]]:
@@ -28,7 +30,9 @@ def stages_of(compiled: MissionAutomaton, automaton: TickAutomaton) -> tuple[NDA
     return stage, tuple(names) if len(names) > 1 else ("mission",)
 
 
-def earliest_of_stage(mission: Mission, scenario: Scenario, grid: GridMap, stage: int) -> NDArray[np.int64]:
+def earliest_of_stage(
+    mission: Mission, scenario: Scenario | Volume, grid: GridMap | VoxelMap, stage: int
+) -> NDArray[np.int64]:
     """Of the mission cut off after the last goal that this stage completes."""
     from tab_marl.field.from_mission import earliest_tick
     from tab_marl.mission.compile import compile_mission

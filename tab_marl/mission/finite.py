@@ -200,7 +200,7 @@ class FiniteAutomaton:
             initial=0,
             accepting=accepting,
             rejecting=rejecting,
-            rank=ticks + 1,
+            rank=(ticks + 1).astype(np.int32),
             location=location,
             branch=branch,
             mission_ticks=np.where(location >= 0, ticks, -1).astype(np.int32),

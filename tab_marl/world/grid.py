@@ -56,7 +56,7 @@ class GridMap:
         row, column = (at.astype(np.int32) for at in np.nonzero(where))
         cell_at = np.full(where.shape, BLOCKED, dtype=np.int32)
         cell_at[where] = np.arange(len(row), dtype=np.int32)
-        centres = (np.stack([column, row], axis=1) + 0.5) * cell_metres
+        centres = (np.stack([column, row], axis=1).astype(np.float64) + 0.5) * cell_metres
         return cls(float(cell_metres), cell_at, centres, row, column)
 
     @property

@@ -49,7 +49,7 @@ class VoxelMap:
         index = np.argwhere(where).astype(np.int32)
         cell_at = np.full(where.shape, BLOCKED, dtype=np.int32)
         cell_at[where] = np.arange(len(index), dtype=np.int32)
-        return cls(float(cell_metres), cell_at, (index[:, ::-1] + 0.5) * cell_metres, index)
+        return cls(float(cell_metres), cell_at, (index[:, ::-1].astype(np.float64) + 0.5) * cell_metres, index)
 
     @property
     def cells(self) -> int:

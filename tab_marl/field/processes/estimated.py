@@ -132,12 +132,12 @@ def _base_states(grid: Cells, states: Floats, headings: int, snap: bool) -> Ints
     """``[N]`` (cell, mode), -1 where lost; `snap`: a point beside the free cells counts for the nearest."""
     dimensions = grid.index.shape[1]
     points = states[:, :dimensions]
-    finite = np.isfinite(states).all(axis=1)
+    finite = np.asarray(np.isfinite(states).all(axis=1))
     if snap:
         cells = grid.cells_of(points).astype(np.int64)
     else:
         at = np.floor(np.where(finite[:, None], points, -1.0)[:, ::-1] / grid.cell_metres).astype(np.int64)
-        inside = finite & ((at >= 0) & (at < np.array(grid.cell_at.shape))).all(axis=1)
+        inside = np.asarray(finite & ((at >= 0) & (at < np.array(grid.cell_at.shape))).all(axis=1))
         cells = np.full(len(points), BLOCKED, dtype=np.int64)
         cells[inside] = grid.cell_at[tuple(at[inside].T)]
     if not headings:

@@ -78,5 +78,5 @@ def speeds_of(metres_per_tick: ArrayLike) -> list[float]:
     """``[R]`` as a list. Raises ValueError for a speed that is not finite and >= 0."""
     speeds = np.atleast_1d(np.asarray(metres_per_tick, dtype=np.float64))
     if speeds.ndim != 1 or len(speeds) == 0 or not (np.isfinite(speeds).all() and (speeds >= 0).all()):
-        raise ValueError(f"metres_per_tick is {metres_per_tick}, must be one or more finite numbers >= 0")
+        raise ValueError(f"metres_per_tick is {metres_per_tick!r}, must be one or more finite numbers >= 0")
     return speeds.tolist()

@@ -70,7 +70,7 @@ def rounded(moves: ArrayLike, shares: ArrayLike, cell_metres: float, modes: Arra
         parts.append(weight * np.prod(np.where(corner, part, 1 - part), axis=1))
     key = np.column_stack([np.concatenate(offsets), np.concatenate(new_modes)])
     merged, inverse = np.unique(key, axis=0, return_inverse=True)
-    share = np.bincount(inverse.ravel(), np.concatenate(parts), minlength=len(merged))
+    share = np.bincount(inverse.ravel(), np.concatenate(parts), minlength=len(merged)).astype(np.float64)
     kept = share > LEAST_SHARE
     return Stencil(merged[kept, :-1], merged[kept, -1], share[kept])
 
