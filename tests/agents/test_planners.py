@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -100,6 +101,27 @@ def test_the_contract(name: str) -> None:
     assert (state is not None) == (name == "MLE-POMCP")
     again.restore(state)
     assert again.learned_state() == agent.learned_state()
+
+
+@pytest.mark.parametrize("ego_task", ["avoidance", "surveillance"])
+@pytest.mark.parametrize("name", ["S-POMCP", "FP-POMCP", "TAB-POMCP", "population-POMCP"])
+def test_every_model_takes_the_other_tasks(name: str, ego_task: str) -> None:
+    """No adversary in reach: the avoiding ego makes for its goal, the watching one for the adversary; both plan."""
+    scenario = WAIT.scenario.for_task(ego_task, Disc(0.3, 0.3, 0.2) if ego_task == "avoidance" else None)  # type: ignore[arg-type]
+    agent = make_planner(name, SMALL)
+    _outcome, track = play(agent, replace(WAIT, scenario=scenario), seed=5, seconds=4.0)
+    assert agent.decision.plan is None
+    moved = {"avoidance": (0.3, 0.3), "surveillance": (2.5, 0.5)}[ego_task]
+    assert math.dist(track[-1][:2], moved) < math.dist(track[0][:2], moved) - 0.2
+
+
+def test_the_parts_of_a_decision_are_those_of_its_time() -> None:
+    agent = make_planner("TAB-POMCP", SMALL)
+    play(agent, WAIT, seed=2, seconds=4.0)
+    parts = np.array(agent.decision_parts)
+    assert parts.shape == (len(agent.decision_seconds), 4)
+    assert (parts > 0).all()
+    assert parts.sum() <= np.sum(agent.decision_seconds) + 1e-3
 
 
 @pytest.mark.parametrize("name", GOAL_AWARE)

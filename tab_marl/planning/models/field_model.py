@@ -49,7 +49,7 @@ class FieldModel:
         self.scenario = scenario
         self.field = solved_field(scenario, mission, options or FieldOptions())
         grid = self.field.problem.grid
-        assert isinstance(grid, GridMap)  # a field made from a mission in a Scenario has one
+        assert isinstance(grid, GridMap)  # a field made from a planar mission has one
         self.grid = grid
         self.map = MissionMap.build(scenario, mission)
         self._cover = camera_cover(scenario, grid)

@@ -1,5 +1,6 @@
 """Detours and shortlists: a slow twin, and cases where going somewhere and coming back in time is known to be right."""
 
+import itertools
 import math
 
 import numpy as np
@@ -9,7 +10,7 @@ from tab_marl.planning.models.interface import SampledPaths, Sighting, TickObser
 from tab_marl.planning.pursuit import interception_kernels
 from tab_marl.planning.pursuit.interception import value_routes
 from tab_marl.planning.pursuit.interception_kernels import first_meeting, meeting_fraction
-from tab_marl.planning.pursuit.itineraries import PursuitOptions, covering, geometry_of, shortlist
+from tab_marl.planning.pursuit.itineraries import EFFORT, PursuitOptions, covering, geometry_of, shortlist
 from tab_marl.planning.pursuit.routes import Itinerary, RouteMap
 from tab_marl.planning.pursuit.scenarios import ReuseOptions, ScenarioSet
 from tab_marl.world.scenario import Scenario
@@ -200,3 +201,14 @@ def test_first_meeting_from_a_slice_is_what_detours_need() -> None:
 def test_bad_reuse_is_refused() -> None:
     with pytest.raises(ValueError, match=r"ReuseOptions.renewed_share is 0"):
         ReuseOptions(renewed_share=0.0)
+
+
+def test_effort_in_milliseconds_is_the_dearest_that_fits() -> None:
+    for effort in EFFORT:
+        options = PursuitOptions.for_milliseconds(effort.milliseconds)
+        assert (options.paths, options.simulations) == (effort.paths, effort.simulations)
+    assert PursuitOptions.for_milliseconds(49.0) == PursuitOptions.for_milliseconds(20.0) == PursuitOptions()
+    assert PursuitOptions.for_milliseconds(0.1) == PursuitOptions.for_milliseconds(EFFORT[0].milliseconds)
+    assert PursuitOptions.for_milliseconds(50, method="routes", paths=7).paths == 7
+    for cheap, dear in itertools.pairwise(EFFORT):
+        assert all(a <= b for a, b in zip(cheap, dear, strict=True))
