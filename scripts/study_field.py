@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 from rich.progress import track
 
-from tab_marl.evaluation import field_study
+from tab_marl.evaluation import field_figures, field_pursuit, field_study
+from tab_marl.evaluation.units import Unit
 
 OUT = Path("runs/study-field")
 HELD_OUT = ("camera-shy", "fickle", "via", "wander")
@@ -34,6 +35,29 @@ def predict(
     done = field_study.play(cells, HELD_OUT, seed, out / "forecasts", workers)
     for _ in track(done, "tasks", total=len(cells)):
         pass
+
+
+@app.command()
+def pursue(
+    missions: str = "M1,M4",
+    family: str = "ambiguous",
+    episodes: Annotated[int, typer.Option(min=1, help="Per mission.")] = 40,
+    fields: Annotated[str, typer.Option(help="separated by ;")] = ";".join(field_pursuit.PLANNED),
+    seed: int = 40_000,
+    out: Path = OUT,
+) -> None:
+    """Let TAB-POMCP plan with each field; resumes where it stopped."""
+    units = [Unit(mission, family, k) for k in range(episodes) for mission in missions.split(",")]
+    done = field_pursuit.play(units, fields.split(";"), HELD_OUT, seed, out / "episodes.csv")
+    for _ in track(done, "episodes", total=len(units)):
+        pass
+
+
+@app.command()
+def draw(out: Path = OUT, docs: Path = Path("docs")) -> None:
+    """Write the page's rows and figure, and print its tables as Markdown."""
+    for table in field_figures.write(out, docs):
+        print(table, end="\n\n")
 
 
 if __name__ == "__main__":

@@ -51,18 +51,16 @@ DEFAULT = FieldOptions(reference="drive_and_turn")
 
 
 def _fields() -> Iterator[tuple[str, FieldOptions]]:
-    plain = {"goal_marginals": False}
-    both = {"goal_marginals": True, "timing_prior": True}
-    yield "paper walk", FieldOptions(reference="paper_walk", **plain)
+    yield "paper walk", FieldOptions(reference="paper_walk", goal_marginals=False)
     for name, motion in {
         "walk": FieldOptions(reference="walk"),
         "tumble": FieldOptions(reference="run_and_tumble"),
         "drive": FieldOptions(reference="drive_and_turn"),
     }.items():
-        yield name, replace(motion, **plain)
+        yield name, replace(motion, goal_marginals=False)
         yield f"{name} + goals", motion
         yield f"{name} + timing", replace(motion, goal_marginals=False, timing_prior=True)
-        yield f"{name} + goals + timing", replace(motion, **both)
+        yield f"{name} + goals + timing", replace(motion, timing_prior=True)
     yield "unicycle + goals", FieldOptions(reference="unicycle")
     yield "tumble 0.5 m + goals", FieldOptions(reference="run_and_tumble", mean_run_metres=0.5)
     yield "drive 0.5 m + goals", replace(DEFAULT, mean_run_metres=0.5)

@@ -87,7 +87,7 @@ def kernel_forecast(
     if done > 1.0 - 1e-12:
         return Forecast(grid, np.zeros(grid.cells), 1.0)
     cells, share = grid.cells_of(points[alive]), share[alive] / (1.0 - done)
-    image = np.nan_to_num(grid.image(np.bincount(cells, weights=share, minlength=grid.cells)))
+    image = np.nan_to_num(grid.image(np.bincount(cells, weights=share, minlength=grid.cells).astype(np.float64)))
     best, table = -np.inf, np.zeros(grid.cells)
     for bandwidth in BANDWIDTHS_METRES:
         sigma = bandwidth / grid.cell_metres
