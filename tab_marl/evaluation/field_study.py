@@ -128,14 +128,16 @@ def _rows(cell: Cell, policies: tuple[str, ...], seed: int) -> list[dict[str, An
     return list(rows_of(cell, policies, seed))
 
 
-def rows_of(cell: Cell, policies: tuple[str, ...], seed: int) -> Iterator[dict[str, Any]]:
-    """Scores of every model on one task, averaged over the policies' trajectories."""
+def rows_of(
+    cell: Cell, policies: tuple[str, ...], seed: int, models: Sequence[str] = (*FIELDS, *OTHERS)
+) -> Iterator[dict[str, Any]]:
+    """Scores of the models on one task, averaged over the policies' trajectories."""
     task = cell.task(seed)
     truth = Truth.of(task, policies, PER_POLICY, cell.rng(seed, 1))
     known = Truth.of(task, policies, KNOWN_PER_POLICY, cell.rng(seed, 2))
     ticks = tuple(round(s / task.scenario.step_seconds) for s in AHEAD_SECONDS)
     head = {"mission": cell.mission, "family": cell.family, "slack": cell.slack, "index": cell.index}
-    for name in (*FIELDS, *OTHERS):
+    for name in models:
         try:
             blank = _Blank(name, task, known, cell.rng(seed, 3))
         except ValueError as error:  # no trajectory of this reference is fast enough, or the option does not apply
