@@ -164,7 +164,7 @@ def _table_bytes(possible: NDArray[np.uint8], cell_bytes: int) -> int:
         return possible.size * cell_bytes
     at_once = max(1, PAGE_BYTES // cell_bytes)
     begin = np.arange(0, possible.shape[1], at_once)
-    pages = np.add.reduceat(possible, begin, axis=1, dtype=np.int64) > 0
+    pages = np.maximum.reduceat(possible, begin, axis=1) > 0
     return int(pages.sum()) * max(PAGE_BYTES, cell_bytes)
 
 
