@@ -19,17 +19,7 @@ from tab_marl.mission.tasks import sample_task
 
 PLANNED: Mapping[str, FieldOptions] = {
     "paper walk, marginal kernel": replace(FIELDS["paper walk"], kernel="marginal"),
-    **{
-        name: FIELDS[name]
-        for name in (
-            "walk",
-            "walk + goals + timing",
-            "tumble + goals",
-            "drive",
-            "drive + goals",
-            "drive + goals + timing",
-        )
-    },
+    **{name: FIELDS[name] for name in ("walk", "tumble + goals", "drive + goals", "drive 0.5 m + goals")},
 }
 """The paper's letter, the literal field, and the repairs."""
 
