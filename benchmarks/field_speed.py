@@ -212,9 +212,9 @@ def scaling(repeats: int) -> None:
     from matplotlib import pyplot
 
     families: dict[str, list[FieldProblem]] = {
-        "cells": [sized(metres, 2, 100) for metres in (0.06, 0.042, 0.03, 0.021, 0.015)],
-        "automaton states": [sized(0.03, stages, 100) for stages in (1, 2, 3, 4, 5)],
-        "ticks": [sized(0.03, 2, ticks) for ticks in (60, 120, 240, 480)],
+        "cells": [sized(metres, 2, 100) for metres in (0.042, 0.03, 0.021, 0.015, 0.0105)],
+        "automaton states": [sized(0.03, stages, 400) for stages in (1, 2, 3, 4, 5)],
+        "ticks": [sized(0.03, 2, ticks) for ticks in (120, 240, 480, 960)],
     }
     solve(families["cells"][0])
     figure, panels = pyplot.subplots(1, 3, figsize=(9, 3), layout="constrained", sharey=True)
@@ -245,6 +245,9 @@ def scaling(repeats: int) -> None:
         )
         middle = np.exp(np.mean(np.log(seconds) - np.log(sizes)))
         panel.loglog(sizes, middle * np.array(sizes, dtype=float), "--", color="0.6", lw=1, label="linear")
+        panel.set_yticks([0.03, 0.1, 0.3], labels=["0.03", "0.1", "0.3"])
+        panel.set_xticks(sizes[::2], labels=[f"{size:,}" for size in sizes[::2]])
+        panel.minorticks_off()
         panel.set_xlabel(name)
         panel.legend(frameon=False)
         panel.spines[["top", "right"]].set_visible(False)
