@@ -14,7 +14,7 @@ from functools import lru_cache
 from typing import Any
 
 from numba import njit, types
-from numba.core import cgutils
+from numba.core import cgutils, ir
 from numba.core.errors import NumbaError
 from numba.experimental.function_type import FunctionModel
 from numba.extending import NativeValue, register_model, unbox
@@ -57,6 +57,27 @@ def _reason(error: NumbaError) -> str:
     return " ".join([*(telling[:2] or lines[:2]), *places[-1:]]).rstrip(":")
 
 
+def _truncates(result: Any) -> bool:
+    """Whether the function returns, in a tuple, a float where its signature has an integer, which numba cuts to one in silence.
+
+    Known only where the function has just been compiled; one found on disk was looked at when it was put there.
+    """
+    annotation = result.type_annotation
+    if not isinstance(result.signature.return_type, types.BaseTuple) or isinstance(annotation, str):
+        return False
+    declared = result.signature.return_type.types
+    for block in annotation.blocks.values():
+        for line in block.body:
+            if isinstance(line, ir.Assign) and isinstance(line.value, ir.Expr) and line.value.op == "cast":
+                given = getattr(annotation.typemap[line.value.value.name], "types", ())
+                if any(
+                    isinstance(d, types.Integer) and isinstance(g, types.Float)
+                    for d, g in zip(declared, given, strict=False)
+                ):
+                    return True
+    return False
+
+
 class Callback:
     """A function compiled for one signature."""
 
@@ -69,6 +90,12 @@ class Callback:
                 "a model's functions take and return; options with compiled=False run them interpreted"
             ) from error
         result = compiled.get_compile_result(signature)
+        if _truncates(result):
+            compiled._cache.flush()  # or the next process would find it on disk and ask no more
+            raise TypeError(
+                f"{function.__name__} returns a float as its observation, which would be cut to a whole number: return "
+                "np.int64(...) of a number that stands for what is seen; for observations that are measured, see ContinuousModel"
+            )
         self._keep = compiled  # the machine code lives as long as this
         self.address = int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
         self._numba_type_ = CallbackType(signature)

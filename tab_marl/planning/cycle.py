@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from tab_marl.planning.model import CompiledModel, ContinuousModel
+from tab_marl.planning.model import CompiledModel, ContinuousModel, check_model
 
 Belief = TypeVar("Belief")
 
@@ -40,36 +39,60 @@ class Game:
 
 
 def play(
-    model: CompiledModel | ContinuousModel,
-    start: ArrayLike,
+    model: Any,
+    start: Any,
     belief: Belief,
     choose: Callable[[Belief, np.random.Generator], int],
     update: Callable[[Belief, int, Any], Belief],
     rng: np.random.Generator | int,
     max_steps: int = 100,
 ) -> Game:
-    """Plays from the hidden state `start` [D] until the process ends or `max_steps` were done.
+    """Plays from the hidden state `start` ([D]; for a model in plain Python any object) until the process ends or `max_steps` were done.
 
+    `model` is the world: a `CompiledModel`, a `ContinuousModel` or a plain Python one; it need not be the planner's.
     ``choose(belief, rng) -> action`` sees the belief alone, ``update(belief, action, observation) -> belief`` follows it; with a
     filter that is ``lambda belief, a, o: belief.update(a, o)``, with a planner
-    ``lambda belief, rng: planner.plan(belief.sample, rng).action``.
+    ``lambda belief, rng: planner.plan(belief, rng).action``. The observation of the step that ends the process is recorded as the
+    model gave it (not a number where a `ContinuousModel` wrote none), but not believed.
     """
     random = np.random.default_rng(rng)
-    state = np.array(start, dtype=np.float64).reshape(model.state_size)
-    word = random.integers(2**64, size=1, dtype=np.uint64)
+    step = _stepper(model, random)
+    state: Any = start
+    if isinstance(model, CompiledModel | ContinuousModel):
+        state = np.array(start, dtype=np.float64).reshape(model.state_size)
     actions, observations, rewards = list[int](), list[Any](), list[float]()
     ended = False
     while not ended and len(actions) < max_steps:
         action = int(choose(belief, random))
-        observation: Any
-        if isinstance(model, ContinuousModel):
-            observation = np.empty(model.observation_size)
-            reward, ended = model.step(state, action, model.data, word, observation)
-        else:
-            observation, reward, ended = model.step(state, action, model.data, word)
+        state, observation, reward, ended = step(state, action)
         actions.append(action)
         observations.append(observation)
         rewards.append(float(reward))
         if not ended:
             belief = update(belief, action, observation)
     return Game(tuple(actions), tuple(observations), tuple(rewards), bool(ended))
+
+
+def _stepper(model: Any, random: np.random.Generator) -> Callable[[Any, int], tuple[Any, Any, float, bool]]:
+    """``(state, action) -> (next state, observation, reward, terminal)`` of a model of any kind."""
+    word = random.integers(2**64, size=1, dtype=np.uint64)
+
+    def numbered(state: Any, action: int) -> tuple[Any, Any, float, bool]:
+        observation, reward, ended = model.step(state, action, model.data, word)
+        return state, int(observation), reward, ended
+
+    def measured(state: Any, action: int) -> tuple[Any, Any, float, bool]:
+        observation = np.full(model.observation_size, np.nan)
+        reward, ended = model.step(state, action, model.data, word, observation)
+        return state, observation, reward, ended
+
+    def plain(state: Any, action: int) -> tuple[Any, Any, float, bool]:
+        result: tuple[Any, Any, float, bool] = model.step(state, action, random)
+        return result
+
+    if isinstance(model, CompiledModel):
+        return numbered
+    if isinstance(model, ContinuousModel):
+        return measured
+    check_model(model)
+    return plain

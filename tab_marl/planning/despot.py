@@ -29,6 +29,7 @@ from tab_marl.planning.model import (
     CompiledModel,
     belief_states,
     check_model,
+    check_numbered,
     draw_particles,
     warn_of_plain_python,
 )
@@ -145,6 +146,7 @@ class Despot:
 
     def __post_init__(self) -> None:
         check_model(self.model)
+        check_numbered(self.model)
         options, least = self.options, 1 + self.options.scenarios * self.model.actions
         if options.max_nodes < least:
             raise ValueError(
@@ -157,7 +159,7 @@ class Despot:
             )
 
     def plan(self, belief: Any, rng: np.random.Generator | int, *, allowed: ArrayLike | None = None) -> Plan:
-        """Searches from `belief` (states, `Particles` or a sampler) and returns the plan; `allowed` restricts the root.
+        """Searches from `belief` (states, `Particles`, a filter or a sampler) and returns the plan; `allowed` restricts the root.
 
         The same seed, model and belief give the identical tree (unless `seconds` ends the search). The tree is made of this
         plan's scenarios; it is not gone on with after a step, where few of them are left.
@@ -197,6 +199,7 @@ def _search_compiled(
 ) -> Search:
     states, weights = belief_states(model, belief, options.scenarios, rng)
     start, seeds = drawn_scenarios(options.scenarios, len(states), weights, rng)
+    began = time.perf_counter()
     step, rollout, _ = model.functions
     total, actions, horizon = options.scenarios, model.actions, options.horizon
     least, greatest = options.reward_bounds or (0.0, 0.0)
@@ -216,12 +219,12 @@ def _search_compiled(
     stream, model_stream, state = np.zeros(1, np.uint64), np.zeros(1, np.uint64), np.empty(model.state_size)
     trivial, upper, powers = options.lower == "trivial", model.upper_function, powers_of(options)
 
-    kernels.add_node(nodes, used, 0, -1, 0, -1)
-    nodes["first_row"][ROOT], nodes["scenarios"][ROOT] = 0, total
-    kernels.bound_node(
-        step, rollout, upper, trivial, least, greatest, model.data, seeds, 0, -1, actions, horizon, options.discount,
-        powers, options.regularisation, nodes, row_states, row_scenarios, used, stream, model_stream, state,
-    )  # fmt: skip
+    def bound_root(scenarios: int) -> None:
+        nodes["first_row"][ROOT], nodes["scenarios"][ROOT] = 0, scenarios
+        kernels.bound_node(
+            step, rollout, upper, trivial, least, greatest, model.data, seeds, 0, -1, actions, horizon, options.discount,
+            powers, options.regularisation, nodes, row_states, row_scenarios, used, stream, model_stream, state,
+        )  # fmt: skip
 
     def run(trials: int, expansions: int) -> int:
         result: int = kernels.search(
@@ -232,11 +235,16 @@ def _search_compiled(
         )  # fmt: skip
         return result
 
-    run(1, 1)  # the root, whatever the time; compiles, or loads, before the clock runs
+    kernels.add_node(nodes, used, 0, -1, 0, -1)
+    bound_root(0)  # of nothing, as is the next line: both compile, or load, before the clock runs
+    run(0, 0)
+    compiling = time.perf_counter() - began
+    bound_root(total)
+    run(1, 1)  # the root, whatever the time
     chunks = Chunks(None if options.seconds is None else time.perf_counter() + options.seconds, 1)
     stopped: Stopped = "simulations"
     while True:
-        before, began = int(used[kernels.EXPANSIONS]), time.perf_counter()
+        before, at = int(used[kernels.EXPANSIONS]), time.perf_counter()
         outcome = run(options.trials, chunks.within(1 << 40))
         if outcome == kernels.NO_ROOM:
             if not _can_grow(nodes, row_states, used, node_cap, row_cap, room):
@@ -250,13 +258,13 @@ def _search_compiled(
         elif outcome == kernels.CLOSED or used[kernels.TRIALS] >= options.trials:
             stopped = "closed" if outcome == kernels.CLOSED else "simulations"
             break
-        if chunks.over(time.perf_counter() - began, max(1, int(used[kernels.EXPANSIONS]) - before)):
+        if chunks.over(time.perf_counter() - at, max(1, int(used[kernels.EXPANSIONS]) - before)):
             stopped = "seconds"
             break
     kernels.back_up_path(nodes, edges, options.regularisation, path, used)
     return finished(
         nodes[: used[kernels.NODES]], edges[: used[kernels.EDGES]], edge_actions[: used[kernels.EDGES]].copy(),
-        options, powers, used, stopped, None,
+        options, powers, used, stopped, None, compiling,
     )  # fmt: skip
 
 
@@ -281,6 +289,7 @@ def finished(
     used: NDArray[np.int64],
     stopped: Stopped,
     observations: tuple[object, ...] | None,
+    compiling: float = 0.0,
 ) -> Search:
     """The search with returns counted from each node on, in place of totals over the scenarios."""
     held = nodes["scenarios"] / options.scenarios * powers[nodes["depth"]]
@@ -298,5 +307,5 @@ def finished(
     tree = SearchTree(plain_nodes, plain_edges, edge_actions, observations, bounds)
     return Search(
         tree, int(used[kernels.TRIALS]), int(used[kernels.DEEPEST]), int(used[kernels.STEPS]), stopped,
-        stopped == "full", (float(bounds[ROOT, 0]), float(bounds[ROOT, 1])),
+        stopped == "full", (float(bounds[ROOT, 0]), float(bounds[ROOT, 1])), compiling,
     )  # fmt: skip

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tab_marl.planning import despot_kernels as kernels
 from tab_marl.planning.interpreted import Stream, mixed
 from tab_marl.planning.kernels import NO_CHILD, UNEXPANDED
-from tab_marl.planning.model import CompiledModel, Particles, belief_states, check_weights
+from tab_marl.planning.model import CompiledModel, belief_objects, belief_states
 from tab_marl.planning.plan import Search, Stopped
 
 if TYPE_CHECKING:
@@ -53,15 +53,7 @@ class _PythonSource:
 
     def __init__(self, model: Any, options: DespotOptions, belief: Any, rng: np.random.Generator) -> None:
         self.model = model
-        weights = None
-        if isinstance(belief, Particles):
-            belief, weights = belief.states, belief.weights
-        elif callable(belief):
-            belief = belief(options.scenarios, rng)
-        self.states = list(belief)
-        if not self.states:
-            raise ValueError("the belief is empty: give at least one state")
-        self.weights = check_weights(weights, len(self.states))
+        self.states, self.weights = belief_objects(belief, options.scenarios, rng)
 
     def seed(self, seed: int, depth: int) -> None:
         self.rng = np.random.default_rng((seed, depth))

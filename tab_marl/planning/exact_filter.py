@@ -39,10 +39,11 @@ class ExactFilter:
     """``[S]``: the belief."""
 
     def __post_init__(self) -> None:
-        data = self.model.data
+        data = getattr(self.model, "data", None)
         if not isinstance(data, TableData | SparseData):
             raise TypeError(
-                f"an exact filter needs tables, and this model's data is a {type(data).__name__}: see table_model"
+                f"an exact filter needs tables, and this {type(self.model).__name__} was not made by table_model: "
+                "give it tables, or use ParticleFilter"
             )
         if not 0 <= self.doubt <= 1:
             raise ValueError(f"doubt is {self.doubt}, must be in [0, 1]")
@@ -93,7 +94,7 @@ class ExactFilter:
     def entropy(self) -> float:
         """Of the belief, in nats."""
         p = self.probabilities[self.probabilities > 0]
-        return float(-(p * np.log(p)).sum())
+        return max(0.0, float(-(p * np.log(p)).sum()))  # of one state: 0, not -0
 
     def report(self) -> FilterReport:
         """What happened so far: updates, and every observation that the tables exclude."""

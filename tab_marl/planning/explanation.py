@@ -142,7 +142,8 @@ class Explanation:
         if self.belief is not None:
             b = self.belief
             lines.append(
-                f"belief: {b.states} states, entropy {b.entropy:.2f} nats (as spread as {b.perplexity:.1f} equally likely ones)"
+                f"belief: {b.states} state{'s' * (b.states != 1)}, entropy {b.entropy:.2f} nats (as spread as "
+                f"{b.perplexity:.1f} equally likely ones)"
             )
         lines.append(
             f"{self.simulations} simulations in {self.seconds * 1000:.1f} ms, {self.nodes} nodes, {self.depth} steps deep"
@@ -230,4 +231,4 @@ def _tally(states: Any, weights: NDArray[np.float64]) -> dict[Any, float]:
 
 def _entropy(shares: NDArray[np.float64]) -> float:
     p = shares[shares > 0] / shares.sum()
-    return float(-(p * np.log(p)).sum())
+    return max(0.0, float(-(p * np.log(p)).sum()))  # of one state: 0, not -0

@@ -12,7 +12,8 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
+from weakref import WeakSet
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +59,13 @@ class Chunks:
     def within(self, left: int) -> int:
         return left if self.deadline is None else min(self.size, left)
 
+    def paused(self, since: float) -> float:
+        """Seconds since then, which the deadline does not count."""
+        seconds = time.perf_counter() - since
+        if self.deadline is not None:
+            self.deadline += seconds
+        return seconds
+
     def over(self, seconds: float, simulations: int) -> bool:
         """Whether time is up, after a chunk that took this long."""
         if self.deadline is None:
@@ -80,6 +88,7 @@ class Growth:
     max_nodes: int
     done: int = 0
     timed_out: bool = False
+    compiling: float = 0.0
     used: NDArray[np.int64] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -138,7 +147,10 @@ class Growth:
         chunks = Chunks(None if seconds is None else time.perf_counter() + seconds)
         for block in particle_blocks(self.simulations, len(self.belief[0]), self.belief[1], self.rng):
             if self.table is None and kernels.most_children(self.nodes, self.edges) > _MANY_CHILDREN:
+                began = time.perf_counter()
                 self._tabulate()
+                self.warm()  # another kernel: compiling it is none of the search's time
+                self.compiling += chunks.paused(began)
             at = 0
             while at < len(block):
                 started = time.perf_counter()
@@ -161,6 +173,7 @@ class Growth:
             tree_steps + rollout_steps,
             "seconds" if self.timed_out else "simulations",
             nodes >= self.max_nodes,
+            compiling=self.compiling,
         )
 
 
@@ -172,10 +185,29 @@ def grow_tree_compiled(
         Growth(model, options, belief_states(model, belief, share, stream), stream, start, share, most)
         for share, most, stream in shares(options.simulations, options.max_nodes, options.workers, rng)
     ]
-    if options.seconds is not None or len(growths) > 1:
-        growths[0].warm()
+    growths[0].compiling = made_ready(model, growths[0])
     run_all([growth.run for growth in growths])
     return merged([growth.finished() for growth in growths], start, options.max_nodes)
+
+
+class Warmable(Protocol):
+    """A worker whose search can be compiled ahead."""
+
+    def warm(self) -> None: ...
+
+
+_ready: WeakSet[Any] = WeakSet()
+"""Models whose search is compiled in this process: asking again would cost a plan some microseconds."""
+
+
+def made_ready(model: Any, growth: Warmable) -> float:
+    """Compiles the search for this model, or loads it, unless that was done; returns the seconds it took."""
+    if model in _ready:
+        return 0.0
+    began = time.perf_counter()
+    growth.warm()
+    _ready.add(model)
+    return time.perf_counter() - began
 
 
 def shares(
@@ -233,6 +265,7 @@ def merged(searches: list[Search], start: SearchTree, max_nodes: int) -> Search:
         sum(search.steps for search in searches),
         "seconds" if any(search.stopped == "seconds" for search in searches) else "simulations",
         any(search.full for search in searches) or int(used[0]) >= max_nodes,
+        compiling=max(search.compiling for search in searches),
     )
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tab_marl.planning.growing import merged, particle_blocks, shares
 from tab_marl.planning.kernels import NO_CHILD, UNEXPANDED
-from tab_marl.planning.model import CompiledModel, Particles, belief_states, check_weights
+from tab_marl.planning.model import CompiledModel, belief_objects, belief_states
 from tab_marl.planning.plan import Search
 from tab_marl.planning.tree import EDGE, NODE, ROOT, SearchTree
 
@@ -92,17 +92,7 @@ class _PythonModel:
 
     def __init__(self, model: Any, count: int, common: bool, belief: Any, rng: np.random.Generator) -> None:
         self.model = model
-        weights = None
-        if isinstance(belief, Particles):
-            belief, weights = belief.states, belief.weights
-        elif callable(belief):
-            belief = belief(count, rng)
-        self.states = list(belief)
-        if not self.states:
-            raise ValueError(
-                "the belief is empty: give at least one state (an updater that lost all particles must refill)"
-            )
-        self.weights = check_weights(weights, len(self.states))
+        self.states, self.weights = belief_objects(belief, count, rng)
         self.stream = Stream(int(rng.integers(2**64, dtype=np.uint64)))
         self.rng = np.random.default_rng(int(rng.integers(2**63)))
         shared = len(self.states) if common else 0

@@ -172,9 +172,20 @@ def check_actions(actions: int, names: tuple[str, ...]) -> None:
 
 def check_model(model: Any) -> None:
     """Raises TypeError when this is no model, ValueError when its actions are wrong."""
+    if isinstance(model, type):
+        raise TypeError(f"the model is the class {model.__name__}: give an instance of it, {model.__name__}(...)")
     if not callable(getattr(model, "step", None)) or not hasattr(model, "actions"):
         raise TypeError(f"the model, a {type(model).__name__}, needs `actions` and `step`: see tab_marl.planning.model")
     check_actions(model.actions, tuple(getattr(model, "action_names", ())))
+
+
+def check_numbered(model: Any) -> None:
+    """Raises TypeError when the model's observations are vectors, which a search that tells observations apart cannot use."""
+    if isinstance(model, ContinuousModel):
+        raise TypeError(
+            "the model is a ContinuousModel, whose observations hardly ever repeat: plan with Pomcpow, or sort its observations "
+            "into numbered bins in a CompiledModel"
+        )
 
 
 class PlainPythonWarning(UserWarning):
@@ -221,11 +232,7 @@ def belief_states(
     model: CompiledModel | ContinuousModel, belief: Any, count: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
     """(states ``[P, D]``, weights ``[P]`` or None) of any kind of belief; a sampler is asked for `count` states."""
-    weights = None
-    if isinstance(belief, Particles):
-        belief, weights = belief.states, belief.weights
-    elif callable(belief):
-        belief = belief(count, rng)
+    belief, weights = _opened(belief, count, rng)
     states = np.ascontiguousarray(belief, dtype=np.float64)
     if states.ndim == 1:
         states = states.reshape(-1, 1)
@@ -238,6 +245,25 @@ def belief_states(
             "the belief is empty: give at least one state (an updater that lost all particles must refill)"
         )
     return states, check_weights(weights, len(states))
+
+
+def belief_objects(belief: Any, count: int, rng: np.random.Generator) -> tuple[list[Any], NDArray[np.float64] | None]:
+    """(states, weights) of a belief over states that are any objects, for a model in plain Python."""
+    belief, weights = _opened(belief, count, rng)
+    states = list(belief)
+    if not states:
+        raise ValueError(
+            "the belief is empty: give at least one state (an updater that lost all particles must refill)"
+        )
+    return states, check_weights(weights, len(states))
+
+
+def _opened(belief: Any, count: int, rng: np.random.Generator) -> tuple[Any, Any]:
+    """(states, weights or None) of states, `Particles`, a filter, or a sampler, which is asked for `count` states."""
+    belief = getattr(belief, "particles", belief)
+    if isinstance(belief, Particles):
+        return belief.states, belief.weights
+    return belief(count, rng) if callable(belief) else belief, None
 
 
 def check_weights(weights: ArrayLike | None, count: int) -> NDArray[np.float64] | None:

@@ -16,9 +16,8 @@ from tab_marl.planning.callbacks import callback
 from tab_marl.planning.model import (
     CompiledModel,
     ContinuousModel,
-    Particles,
+    belief_objects,
     belief_states,
-    check_weights,
     draw_particles,
 )
 from tab_marl.planning.tables import SparseData, TableData
@@ -124,15 +123,8 @@ class PythonDynamics:
         self.weighs = likelihood is not None
 
     def draw(self, belief: Any, count: int, rng: np.random.Generator) -> NDArray[Any]:
-        weights = None
-        if isinstance(belief, Particles):
-            belief, weights = belief.states, belief.weights
-        elif callable(belief):
-            belief = belief(count, rng)
-        states = _objects(list(belief))
-        if len(states) == 0:
-            raise ValueError("the belief is empty: give at least one state")
-        return states[draw_particles(count, len(states), check_weights(weights, len(states)), rng)]
+        states, weights = belief_objects(belief, count, rng)
+        return _objects(states)[draw_particles(count, len(states), weights, rng)]
 
     def advance(
         self, states: NDArray[Any], action: int, observation: Any, rng: np.random.Generator

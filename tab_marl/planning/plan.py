@@ -38,6 +38,7 @@ class Plan:
     steps: int
     """Calls of the model's step function (those inside a rollout of the model's own are not seen)."""
     seconds: float
+    """Of wall time, not counting what was compiled."""
     tree: SearchTree
     names: tuple[str, ...]
     """``[A]`` of the actions."""
@@ -98,6 +99,8 @@ class Search:
     stopped: Stopped = "simulations"
     full: bool = False
     bounds: tuple[float, float] | None = None
+    compiling: float = 0.0
+    """Seconds spent on compiling the search, or loading it, the first time that a model is planned for."""
 
 
 def decided(search: Search, model: Any, choose: Literal["value", "visits"], seconds: float) -> Plan:
@@ -123,7 +126,7 @@ def decided(search: Search, model: Any, choose: Literal["value", "visits"], seco
             best = key, number
     action = numbers[0] if best is None else best[1]
     return Plan(
-        action, values, visits, search.simulations, search.depth, search.steps, seconds, tree, action_names(model),
+        action, values, visits, search.simulations, search.depth, search.steps, seconds - search.compiling, tree, action_names(model),
         search.stopped, search.full, search.bounds,
     )  # fmt: skip
 

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from tab_marl.planning.bounds import check_horizon, horizon_of, require
 from tab_marl.planning.growing import grow_tree_compiled
 from tab_marl.planning.interpreted import asked_prior, grow_tree_in_python
-from tab_marl.planning.model import CompiledModel, belief_states, check_model, warn_of_plain_python
+from tab_marl.planning.model import CompiledModel, belief_states, check_model, check_numbered, warn_of_plain_python
 from tab_marl.planning.plan import Plan, action_numbers, decided
 from tab_marl.planning.tree import ROOT, SearchTree
 
@@ -87,6 +87,7 @@ class Pomcp:
 
     def __post_init__(self) -> None:
         check_model(self.model)
+        check_numbered(self.model)
         if self.options.workers > 1 and not isinstance(self.model, CompiledModel):
             raise ValueError(
                 f"workers is {self.options.workers}, must be 1 for a model in plain Python: the interpreter runs one thread at "
@@ -104,7 +105,7 @@ class Pomcp:
         latest: tuple[int, int] | None = None,
         start: SearchTree | None = None,
     ) -> Plan:
-        """Searches from `belief` (states, `Particles` or a sampler) and returns the plan.
+        """Searches from `belief` (states, `Particles`, a filter or a sampler) and returns the plan.
 
         `allowed` restricts the root: action numbers, or bool[A]. `prior_values` [A] with `prior_counts` [A] (or one count for
         all) start the root's actions as if tried that often with that mean return. Without them the model's own prior is asked

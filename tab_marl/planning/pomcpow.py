@@ -25,6 +25,7 @@ from tab_marl.planning.growing import (
     ROOT_LOG,
     Chunks,
     grown,
+    made_ready,
     merged,
     particle_blocks,
     run_all,
@@ -117,7 +118,7 @@ class Pomcpow:
             )
 
     def plan(self, belief: Any, rng: np.random.Generator | int, *, allowed: ArrayLike | None = None) -> Plan:
-        """Searches from `belief` (states, `Particles` or a sampler) and returns the plan; `allowed` restricts the root.
+        """Searches from `belief` (states, `Particles`, a filter or a sampler) and returns the plan; `allowed` restricts the root.
 
         The same seed, model and belief give the identical tree (unless `seconds` ends the search). The tree is not gone on with
         after a step: what is really observed is not in it. Raises ValueError when a likelihood is negative, not finite, or 0
@@ -254,7 +255,7 @@ def _search_compiled(
         _Growth(model, options, belief, share, start)
         for share in shares(options.simulations, options.max_nodes, options.workers, rng)
     ]
-    growths[0].warm()
+    compiling = made_ready(model, growths[0])
     run_all([growth.run for growth in growths])
     firsts = np.cumsum([0, *(int(growth.used[kernels.NODES]) for growth in growths)]).tolist()
     search = merged(
@@ -262,4 +263,6 @@ def _search_compiled(
     )
     seen = np.concatenate([growth.seen[: growth.used[kernels.NODES]] for growth in growths])
     tree = SearchTree(search.tree.nodes, search.tree.edges, search.tree.edge_actions, Readings(seen))
-    return Search(tree, search.simulations, search.depth, search.steps, search.stopped, search.full)
+    return Search(
+        tree, search.simulations, search.depth, search.steps, search.stopped, search.full, compiling=compiling
+    )

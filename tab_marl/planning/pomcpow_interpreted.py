@@ -14,7 +14,7 @@ import numpy as np
 from tab_marl.planning.growing import merged, particle_blocks, shares
 from tab_marl.planning.interpreted import Stream, mixed
 from tab_marl.planning.kernels import NO_CHILD, UNEXPANDED
-from tab_marl.planning.model import ContinuousModel, Particles, belief_states, check_weights
+from tab_marl.planning.model import ContinuousModel, belief_objects, belief_states
 from tab_marl.planning.plan import Search, Stopped
 from tab_marl.planning.pomcpow_kernels import FIRST_ROOM
 from tab_marl.planning.tree import EDGE, NODE, ROOT, SearchTree
@@ -62,15 +62,7 @@ class _PythonSource:
 
     def __init__(self, model: Any, count: int, belief: Any, rng: np.random.Generator) -> None:
         self.model = model
-        weights = None
-        if isinstance(belief, Particles):
-            belief, weights = belief.states, belief.weights
-        elif callable(belief):
-            belief = belief(count, rng)
-        self.states = list(belief)
-        if not self.states:
-            raise ValueError("the belief is empty: give at least one state")
-        self.weights = check_weights(weights, len(self.states))
+        self.states, self.weights = belief_objects(belief, count, rng)
         self.stream = _Uniform(int(rng.integers(2**64, dtype=np.uint64)))
         self.rng = np.random.default_rng(int(rng.integers(2**63)))
         self.has_rollout = hasattr(model, "rollout")
