@@ -17,6 +17,7 @@ import typer
 from tab_marl.agents.planners import PlannerAgent, PlannerOptions
 from tab_marl.evaluation.episode import opponent, run_episode, zoo_names
 from tab_marl.evaluation.units import Unit, unit_seeds
+from tab_marl.field.problem import FieldOptions
 from tab_marl.mission.tasks import Task, sample_task
 from tab_marl.planning.pursuit.decide import PursuitOptions
 from tab_marl.planning.pursuit.itineraries import EFFORT
@@ -58,6 +59,7 @@ VARIANTS: dict[str, Variant] = {
     "tree, branches on sightings": pursuing("TAB-POMCP", branch_on_sightings=True),
     "tree, no changes in rollouts": pursuing("TAB-POMCP", switches=0),
     "tree, no detours": pursuing("TAB-POMCP", detours=0),
+    "tree, nearer goals likelier": Variant("TAB-POMCP", PlannerOptions(tab_field=FieldOptions(goal_marginals=False))),
     "tree, rewards as they are": pursuing("TAB-POMCP", completion_weight=1.0),
 }
 

@@ -22,7 +22,7 @@ from tab_marl.envs.ego_observation import parse_ego_observation
 from tab_marl.envs.intercept_v0 import parallel_env
 from tab_marl.evaluation.episode import opponent, zoo_names
 from tab_marl.evaluation.film import write_film
-from tab_marl.evaluation.statistics import bootstrap_mean
+from tab_marl.evaluation.statistics import bootstrap_mean, share
 from tab_marl.mission.tasks import Task, sample_task
 from tab_marl.planning.pursuit.routes import RouteMap
 
@@ -84,6 +84,13 @@ def play(task: Task, name: str, seed: int, film: Path | None = None) -> dict[str
     return {"return": total, "watched s": watched, "watched %": 100.0 * watched / task.scenario.horizon_seconds}
 
 
+def cell(column: str, values: list[float]) -> str:
+    """A mean with its interval; for a share of episodes the one that also holds where all went alike."""
+    scale = 100.0 if column in ("met %", "arrived %") else 1.0
+    found = share(np.array(values) / 100.0) if scale == 100.0 else bootstrap_mean(values)
+    return f"{scale * found.value:.1f} [{scale * found.low:.1f}, {scale * found.high:.1f}]"
+
+
 def main(
     tasks: Annotated[str, typer.Option(help="avoidance, surveillance or both")] = "avoidance,surveillance",
     planners: str = "random,scripted,S-POMCP,TAB-POMCP,oracle",
@@ -106,8 +113,7 @@ def main(
         for column in first:
             table.add_column(column, justify="right")
         for name, rows in found.items():
-            cells = [bootstrap_mean([row[column] for row in rows]) for column in first]
-            table.add_row(name, *(f"{c.value:.1f} [{c.low:.1f}, {c.high:.1f}]" for c in cells))
+            table.add_row(name, *(cell(column, [row[column] for row in rows]) for column in first))
         Console(width=110).print(table)
 
 
