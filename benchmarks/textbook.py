@@ -35,10 +35,10 @@ from tab_marl.planning.textbook import (
 DISCOUNT = 0.95
 PUBLISHED = {
     "tag": "SARSOP -6.03, DESPOT -6.23, POMCP -7.14 (Ye et al. 2017)",
-    "rocksample-7-8": "SARSOP 21.47, DESPOT 20.93, POMCP 16.80 (Ye et al. 2017), POMCP 20.71 (Silver and Veness 2010)",
-    "rocksample-11-11": "SARSOP 21.56, DESPOT 21.75, POMCP 18.10 (Ye et al. 2017), POMCP 20.01 (Silver and Veness 2010)",
-    "rocksample-15-15": "DESPOT 18.64, POMCP 12.23 (Ye et al. 2017), POMCP 15.32 (Silver and Veness 2010); other rocks",
-    "lasertag": "DESPOT -8.45, POMCP -19.58 (Ye et al. 2017); DESPOT -8.9, POMCPOW -10.3, POMCP -14.1 (Sunberg 2018)",
+    "rocksample-7-8": "see Ye et al. 2017, Silver and Veness 2010",
+    "rocksample-11-11": "see Ye et al. 2017, Silver and Veness 2010",
+    "rocksample-15-15": "see Ye et al. 2017, Silver and Veness 2010; their rocks are others",
+    "lasertag": "POMCP -19.58 (Ye et al. 2017); DESPOT -8.9, POMCPOW -10.3, POMCP -14.1 (Sunberg 2018)",
     "light-dark": "POMCP on bins 61.1, POMCPOW 56.1, DESPOT on bins 54.2 (Sunberg and Kochenderfer 2018)",
 }
 

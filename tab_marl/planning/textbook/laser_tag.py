@@ -5,7 +5,7 @@ The rules are those of the DESPOT package (AdaCompNUS/despot, ``laser_tag.cpp``)
 at the first obstacle, border or the target; its reading is never beyond that, falls short of it by a half-normal error of standard
 deviation 2.5, and is rounded down to whole units: some 1.5 million observations, of which a tree sees hardly any twice.
 
-Published at discount .95: DESPOT -8.45 +- 0.26, POMCP -19.58 +- 0.06 (Ye et al., JAIR 58, 2017); DESPOT -8.9 +- 0.2, POMCPOW
+Published at discount .95: POMCP -19.58 +- 0.06 (Ye et al., JAIR 58, 2017); DESPOT -8.9 +- 0.2, POMCPOW
 -10.3 +- 0.2, QMDP -10.5 +- 0.2, POMCP with progressive widening -10.6 +- 0.2, PFT-DPW -11.1 +- 0.2, POMCP -14.1 +- 0.2 (Sunberg and
 Kochenderfer, ICAPS 2018, whose laser differs a little).
 """

@@ -5,9 +5,8 @@ SARSOP's figures are for: sampling earns +10 from a good rock, which turns it ba
 border earns +10 and ends; walking into another border or sampling where no rock is costs 100; a check of a rock at distance d
 (Euclidean) is right with probability (1 + 2^(-d/20)) / 2. The rover's cell is known, each rock is good with probability 1/2.
 
-Published at discount .95: [7,8] SARSOP 21.47 +- 0.04, DESPOT 20.93 +- 0.30, POMCP 16.80 +- 0.30; [11,11] SARSOP 21.56 +- 0.11,
-DESPOT 21.75 +- 0.30, POMCP 18.10 +- 0.36; [15,15] DESPOT 18.64 +- 0.28, POMCP 12.23 +- 0.32 (Ye et al., JAIR 58, 2017); POMCP
-with preferred actions, by its authors: [7,8] 20.71 +- 0.21, [11,11] 20.01 +- 0.23, [15,15] 15.32 +- 0.28 (NeurIPS 2010).
+Figures at discount .95 are in Ye et al. (JAIR 58, 2017) and in Silver and Veness (NeurIPS 2010, with preferred actions, as
+`preferred` has them); their [15,15] has other rocks.
 """
 
 from __future__ import annotations
