@@ -5,8 +5,8 @@ SARSOP's figures are for: sampling earns +10 from a good rock, which turns it ba
 border earns +10 and ends; walking into another border or sampling where no rock is costs 100; a check of a rock at distance d
 (Euclidean) is right with probability (1 + 2^(-d/20)) / 2. The rover's cell is known, each rock is good with probability 1/2.
 
-Figures at discount .95 are in Ye et al. (JAIR 58, 2017) and in Silver and Veness (NeurIPS 2010, with preferred actions, as
-`preferred` has them); their [15,15] has other rocks.
+Figures at discount .95 are in Ye et al. (JAIR 58, 2017) and, with preferred actions, in Silver and Veness (NeurIPS 2010); their
+[15,15] has other rocks.
 """
 
 from __future__ import annotations
