@@ -63,9 +63,9 @@ def _truncates(result: Any) -> bool:
     Known only where the function has just been compiled; one found on disk was looked at when it was put there.
     """
     annotation = result.type_annotation
-    if not isinstance(result.signature.return_type, types.BaseTuple) or isinstance(annotation, str):
+    declared = getattr(result.signature.return_type, "types", ())
+    if not declared or isinstance(annotation, str):
         return False
-    declared = result.signature.return_type.types
     for block in annotation.blocks.values():
         for line in block.body:
             if isinstance(line, ir.Assign) and isinstance(line.value, ir.Expr) and line.value.op == "cast":
