@@ -59,7 +59,7 @@ def _input() -> Iterator[None]:
 def show_field(asked: FieldRequest) -> str:
     """Solve, write what was asked for, and say in words what the field says. Raises UserError."""
     from tab_marl.field import FieldOptions, FieldProblem, solve
-    from tab_marl.field.animation import check_film
+    from tab_marl.field.answers.animation import check_film
 
     for path, kinds in ((asked.picture, PICTURES), (asked.answers, ANSWERS), (asked.save, (".npz",))):
         _check_target(path, kinds)

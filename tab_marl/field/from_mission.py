@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tab_marl.field import processes
+from tab_marl.field.answers.stages import stages_of
 from tab_marl.field.options import FieldOptions
 from tab_marl.field.problem import FieldProblem
 from tab_marl.field.reference import Reference
 from tab_marl.field.sizing import refuse_before_building
-from tab_marl.field.stages import stages_of
 from tab_marl.mission.automaton import MissionAutomaton
 from tab_marl.mission.compile import compile_mission
 from tab_marl.mission.joint import JointAutomaton, compile_joint

@@ -20,10 +20,10 @@ from tab_marl.world.volume import Volume
 from tab_marl.world.voxels import VoxelMap
 
 if TYPE_CHECKING:
-    from tab_marl.field.events import SoftConstraint, TimingPrior
+    from tab_marl.field.constraints.events import SoftConstraint, TimingPrior
+    from tab_marl.field.constraints.tracking import Tracking
     from tab_marl.field.from_mission import Process
     from tab_marl.field.sizing import FieldSize
-    from tab_marl.field.tracking import Tracking
     from tab_marl.mission.model import Mission
     from tab_marl.mission.unroll import TickAutomaton
 
@@ -146,7 +146,7 @@ class FieldProblem:
         if self.mission is None or self.grid is None or self.scenario is None:
             given = np.broadcast_to(np.asarray(self.earliest_tick, dtype=np.int64), nothing.shape)
             return given if stage == len(self.stage_names) - 1 else nothing
-        from tab_marl.field.stages import earliest_of_stage
+        from tab_marl.field.answers.stages import earliest_of_stage
 
         return earliest_of_stage(self.mission, self.scenario, self.grid, stage)
 
@@ -155,7 +155,7 @@ class FieldProblem:
 
         The automaton grows by what the events need to be watched. Raises ValueError for an event that cannot be.
         """
-        from tab_marl.field.tracking import with_constraints
+        from tab_marl.field.constraints.tracking import with_constraints
 
         return with_constraints(self, constraints)
 
@@ -236,6 +236,6 @@ class FieldProblem:
 
         Exact for the field. A filter that sees the adversary do what the reference cannot has no state left for it.
         """
-        from tab_marl.field.pruning import pruned
+        from tab_marl.field.messages.pruning import pruned
 
         return pruned(self)

@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tab_marl.field import kernels
+from tab_marl.field.messages.tables import LAZY_BYTES
 from tab_marl.field.options import FieldOptions
-from tab_marl.field.tables import LAZY_BYTES
 from tab_marl.mission.unroll import TickAutomaton
 
 if TYPE_CHECKING:
-    from tab_marl.field.constraints import Tilt
+    from tab_marl.field.constraints.tilt import Tilt
     from tab_marl.field.problem import FieldProblem
 
 GIGABYTE = 1e9
@@ -144,7 +144,7 @@ def memory_of(problem: FieldProblem) -> Memory:
 
 
 def _tilt_of(problem: FieldProblem) -> Tilt:
-    from tab_marl.field.constraints import Tilt
+    from tab_marl.field.constraints.tilt import Tilt
 
     return Tilt.of(problem)
 
@@ -247,7 +247,7 @@ def _seconds_of_pass(problem: FieldProblem, tilt: Tilt, fitted: bool) -> float:
 def _timed(problem: FieldProblem, rows: int, fitted: bool, sampled: bool) -> float:
     """Seconds of one pass over a counting automaton of so many states."""
     from tab_marl.field.belief import ProductBelief
-    from tab_marl.field.constraints import Tilt
+    from tab_marl.field.constraints.tilt import Tilt
     from tab_marl.field.sampling import sample_paths
     from tab_marl.field.solve import SAMPLED_PATHS, message
     from tab_marl.field.tab_field import expected_transitions

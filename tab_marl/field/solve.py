@@ -11,19 +11,20 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.field import backward_kernels, tracking_kernels
 from tab_marl.field.belief import ProductBelief
 from tab_marl.field.chain import ProductChain, product_chain
-from tab_marl.field.constraints import Tilt
-from tab_marl.field.fitting import History, fit
+from tab_marl.field.constraints import tracking_kernels
+from tab_marl.field.constraints.fitting import History, fit
+from tab_marl.field.constraints.tilt import Tilt
 from tab_marl.field.infeasible import InfeasibleField
+from tab_marl.field.messages import backward_kernels
+from tab_marl.field.messages.stencil import Stencil, no_stencil, stencil_of
+from tab_marl.field.messages.support import Support, support_of
+from tab_marl.field.messages.tables import zeros
 from tab_marl.field.problem import COMPLETE, UNDER_WAY, FieldProblem
 from tab_marl.field.sampling import Trajectories, sample_paths
 from tab_marl.field.sizing import refuse_beyond_memory
-from tab_marl.field.stencil import Stencil, no_stencil, stencil_of
-from tab_marl.field.support import Support, support_of
 from tab_marl.field.tab_field import TabField, expected_transitions, start_log_partition
-from tab_marl.field.tables import zeros
 from tab_marl.world.scenario import UnknownName
 
 Floats = NDArray[np.float64]
@@ -53,7 +54,7 @@ def solve(problem: FieldProblem, backend: Literal["numba", "torch"] = "numba", d
     """
     compute: Message = message
     if backend == "torch":
-        from tab_marl.field import torch_backend
+        from tab_marl.field.messages import torch_backend
 
         torch_backend.check(device)
         compute = partial(message, torch_device=device)
@@ -75,7 +76,7 @@ def solve(problem: FieldProblem, backend: Literal["numba", "torch"] = "numba", d
 def _solve(problem: FieldProblem, compute: Message) -> TabField:
     refuse_beyond_memory(problem)
     if problem.constraints:
-        from tab_marl.field.dual import fit_soft
+        from tab_marl.field.constraints.dual import fit_soft
 
         chain, tilt, flux, report = fit_soft(problem, compute)
         return TabField(problem, chain, tilt, flux, report.worst, report.passes, report)
@@ -164,7 +165,7 @@ def message(problem: FieldProblem, tilt: Tilt, torch_device: str | None = None) 
         )  # fmt: skip
         order = order[~over]
     if torch_device is not None:
-        from tab_marl.field import torch_backend
+        from tab_marl.field.messages import torch_backend
 
         torch_backend.backward(order, problem, weight, peak, value, log_scale, torch_device)
     else:

@@ -11,25 +11,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tab_marl.field import kernels
+from tab_marl.field.answers.evidence import Observation
+from tab_marl.field.answers.paths import MostLikelyPath, most_likely_path, path_entropy
+from tab_marl.field.answers.posterior import Posterior, posterior
 from tab_marl.field.belief import EXACT, BeliefOptions, ProductBelief
 from tab_marl.field.chain import ProductChain, Table
-from tab_marl.field.constraints import Tilt
-from tab_marl.field.events import Completes, Event
-from tab_marl.field.evidence import Observation
-from tab_marl.field.paths import MostLikelyPath, most_likely_path, path_entropy
-from tab_marl.field.posterior import Posterior, posterior
+from tab_marl.field.constraints.events import Completes, Event
+from tab_marl.field.constraints.tilt import Tilt
+from tab_marl.field.constraints.tracking import HAPPENED, track
+from tab_marl.field.messages.sweep import Sweep, moments, sweep
+from tab_marl.field.messages.tables import zeros
 from tab_marl.field.sampling import Trajectories, sample_paths
-from tab_marl.field.sweep import Sweep, moments, sweep
-from tab_marl.field.tables import zeros
-from tab_marl.field.tracking import HAPPENED, track
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from matplotlib.figure import Figure
 
+    from tab_marl.field.constraints.report import FitReport
     from tab_marl.field.problem import FieldProblem
-    from tab_marl.field.report import FitReport
 
 Floats = NDArray[np.float64]
 
@@ -105,7 +105,7 @@ class TabField:
     @cached_property
     def branch_shares(self) -> dict[str, float]:
         """Place -> share of all counted visits at places that can stand for one another (1 where nothing can)."""
-        from tab_marl.field.constraints import alternatives
+        from tab_marl.field.constraints.tilt import alternatives
 
         visits = self.tilt.visits(self.transitions)
         total = visits.copy()
@@ -221,14 +221,14 @@ class TabField:
 
     def save(self, path: str | Path) -> None:
         """Write it to one ``.npz`` file: arrays and JSON, no code. `TabField.load` reads it back."""
-        from tab_marl.field.storage import save_field
+        from tab_marl.field.answers.storage import save_field
 
         save_field(self, path)
 
     @classmethod
     def load(cls, path: str | Path) -> TabField:
         """Read what `save` wrote; nothing in the file is executed. Raises FieldFormatError, OSError."""
-        from tab_marl.field.storage import load_field
+        from tab_marl.field.answers.storage import load_field
 
         return load_field(path)
 
@@ -247,15 +247,15 @@ class TabField:
     def plot(self, path: str | Path | None = None, panels: int = 8) -> Figure:
         """Small multiples of the occupancy over time, the likeliest and sampled paths, and when the stages are completed.
 
-        Written to `path` if given. Needs matplotlib; more pictures: `tab_marl.field.drawing`.
+        Written to `path` if given. Needs matplotlib; more pictures: `tab_marl.field.answers.drawing`.
         """
-        from tab_marl.field.drawing import draw_field
+        from tab_marl.field.answers.drawing import draw_field
 
         return draw_field(self, path, panels)
 
     def animate(self, path: str | Path, frames_per_second: int = 8) -> int:
         """The occupancy over time as a .gif, or .mp4 where ffmpeg is installed; returns the number of frames."""
-        from tab_marl.field.animation import animate_field
+        from tab_marl.field.answers.animation import animate_field
 
         return animate_field(self, path, frames_per_second)
 

@@ -65,7 +65,7 @@ def test_pettingzoo_aec(tmp_path) -> None:
     env = pettingzoo.make("aec", "tab_marl/intercept-v0", render_mode="rgb_array", max_cycles=STEPS)
     env = RecordVideoAec(env, str(tmp_path))
     env.reset(seed=0)
-    for agent in env.agent_iter():
+    for _agent in env.agent_iter():
         *_, terminated, truncated, _ = env.last()
         env.step(None if terminated or truncated else np.array([1.0, 0.2], dtype=np.float32))
     env.close()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tab_marl.field import FieldOptions, FieldProblem, IsAt, Passes, SoftConstraint, Tracker, solve
-from tab_marl.field.evidence import ImpossibleEvidence, Likelihood, NearZeroEvidence, Seen, Unseen
+from tab_marl.field.answers.evidence import ImpossibleEvidence, Likelihood, NearZeroEvidence, Seen, Unseen
 from tab_marl.mission import Constraint, Mission
 from tab_marl.world.regions import Box
 

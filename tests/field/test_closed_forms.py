@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import minimize
 
 from tab_marl.field import FieldOptions, FieldProblem, InfeasibleField, from_matrices, run_and_tumble, solve, walk
-from tab_marl.field.constraints import Tilt, ticks_of
+from tab_marl.field.constraints.tilt import Tilt, ticks_of
 from tab_marl.mission import Constraint, Mission
 from tab_marl.mission.unroll import TickAutomaton
 from tab_marl.world.grid import GridMap

@@ -9,9 +9,9 @@ import pytest
 from PIL import Image
 
 from tab_marl.field import FieldOptions, FieldProblem, TabField, solve
-from tab_marl.field.animation import FilmError, _ffmpeg
-from tab_marl.field.drawing import draw_posterior
-from tab_marl.field.evidence import Seen, Unseen
+from tab_marl.field.answers.animation import FilmError, _ffmpeg
+from tab_marl.field.answers.drawing import draw_posterior
+from tab_marl.field.answers.evidence import Seen, Unseen
 from tab_marl.mission import Constraint, Mission
 
 TWO_STAGES = Mission(
@@ -67,7 +67,7 @@ def test_films(field, tmp_path):
 
 
 def test_mp4_without_ffmpeg_says_what_to_do(field, tmp_path, monkeypatch):
-    from tab_marl.field import animation
+    from tab_marl.field.answers import animation
 
     monkeypatch.setattr(animation, "_ffmpeg", lambda: None)
     with pytest.raises(FilmError, match=r"needs the program ffmpeg.*write a \.gif"):

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tab_marl.field import backward_kernels, from_matrices, kernels, product_chain, sampling_kernels
+from tab_marl.field import from_matrices, kernels, product_chain, sampling_kernels
 from tab_marl.field.belief import ProductBelief
-from tab_marl.field.stencil import no_stencil
+from tab_marl.field.messages import backward_kernels
+from tab_marl.field.messages.stencil import no_stencil
 
 
 class Small:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tab_marl.field import FieldOptions, FieldProblem, sample_paths, solve
-from tab_marl.field.fitting import reweighting_step
+from tab_marl.field.constraints.fitting import reweighting_step
 from tab_marl.mission import Constraint, Mission
 from tab_marl.world.grid import GridMap
 from tab_marl.world.regions import Box, Disc

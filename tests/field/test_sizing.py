@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tab_marl.field import FieldOptions, FieldProblem, FieldTooLarge, run_and_tumble, solve
-from tab_marl.field.support import support_of
+from tab_marl.field.messages.support import support_of
 from tab_marl.mission import FiniteAutomaton
 from tab_marl.world.grid import GridMap
 from tab_marl.world.scenario import Scenario

@@ -10,8 +10,9 @@ import zipfile
 import numpy as np
 import pytest
 
-from tab_marl.field import FieldOptions, FieldProblem, Passes, SoftConstraint, TabField, storage
-from tab_marl.field.storage import FieldFormatError
+from tab_marl.field import FieldOptions, FieldProblem, Passes, SoftConstraint, TabField
+from tab_marl.field.answers import storage
+from tab_marl.field.answers.storage import FieldFormatError
 from tab_marl.mission import Constraint, Mission
 from tab_marl.world.scenario import Scenario
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tab_marl.field import FieldOptions, FieldProblem, SoftConstraint, solve
-from tab_marl.field.events import Passes
+from tab_marl.field.constraints.events import Passes
 from tab_marl.mission import Constraint, Mission
 from tab_marl.world.scenario import Scenario
 

@@ -17,12 +17,12 @@ from scipy import optimize, sparse
 from scipy.special import logit
 
 from tab_marl.field.chain import ProductChain
-from tab_marl.field.constraints import Tilt, alternatives, reachable_places, ticks_of
-from tab_marl.field.contradiction import ContradictoryConstraints, explain
-from tab_marl.field.events import Completes, SoftConstraint, TimingPrior
+from tab_marl.field.constraints.contradiction import ContradictoryConstraints, explain
+from tab_marl.field.constraints.events import Completes, SoftConstraint, TimingPrior
+from tab_marl.field.constraints.report import ConstraintFit, FitReport
+from tab_marl.field.constraints.tilt import Tilt, alternatives, reachable_places, ticks_of
 from tab_marl.field.infeasible import InfeasibleField
 from tab_marl.field.problem import COMPLETE, FieldProblem
-from tab_marl.field.report import ConstraintFit, FitReport
 from tab_marl.field.tab_field import expected_transitions, start_log_partition
 
 Floats = NDArray[np.float64]

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.field.constraints import Tilt
+from tab_marl.field.constraints.tilt import Tilt
 
 Floats = NDArray[np.float64]
 

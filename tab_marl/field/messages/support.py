@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from tab_marl.field import support_kernels as kernels
+from tab_marl.field.messages import support_kernels as kernels
 from tab_marl.field.problem import UNDER_WAY, FieldProblem
 from tab_marl.field.reference import Reference
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from tab_marl.field import path_kernels
+from tab_marl.field.answers import path_kernels
 from tab_marl.field.belief import EXACT, ProductBelief
 from tab_marl.field.chain import Table
 from tab_marl.field.problem import COMPLETE, FAILED, UNDER_WAY

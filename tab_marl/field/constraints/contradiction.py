@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from tab_marl.field.chain import ProductChain
-from tab_marl.field.constraints import Tilt
-from tab_marl.field.events import Completes, SoftConstraint
+from tab_marl.field.constraints.events import Completes, SoftConstraint
+from tab_marl.field.constraints.tilt import Tilt
 from tab_marl.field.infeasible import InfeasibleField
 from tab_marl.field.problem import COMPLETE, FieldProblem
 from tab_marl.field.tab_field import start_log_partition
 
 if TYPE_CHECKING:
-    from tab_marl.field.tracking import Tracking
+    from tab_marl.field.constraints.tracking import Tracking
 
 Floats = NDArray[np.float64]
 MOST_EVENTS = 8
@@ -123,7 +123,7 @@ def reachable_patterns(
 
 def _happened_after(tracking: Tracking) -> NDArray[np.bool_]:
     """``[K, Q, L]``: event k has happened once this transition is taken."""
-    from tab_marl.field.tracking import HAPPENED
+    from tab_marl.field.constraints.tracking import HAPPENED
 
     return np.asarray((tracking.decided == HAPPENED)[:, :, None] | tracking.happens)
 

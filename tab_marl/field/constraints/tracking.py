@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.field.events import Completes, Event, SoftConstraint, TimingPrior, Tracker
+from tab_marl.field.constraints.events import Completes, Event, SoftConstraint, TimingPrior, Tracker
 from tab_marl.field.problem import COMPLETE, UNDER_WAY, FieldProblem
 from tab_marl.mission.unroll import TickAutomaton
 
@@ -55,7 +55,7 @@ class TrackedAutomaton(TickAutomaton):
 
 def with_constraints(problem: FieldProblem, constraints: Sequence[SoftConstraint | TimingPrior]) -> FieldProblem:
     """The problem whose automaton tracks the constraints' events (and the tick, where a timing prior needs it)."""
-    from tab_marl.field.constraints import PATH_DEPENDENT, ticks_of
+    from tab_marl.field.constraints.tilt import PATH_DEPENDENT, ticks_of
 
     for constraint in constraints:
         if not isinstance(constraint, SoftConstraint | TimingPrior):

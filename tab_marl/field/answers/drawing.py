@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.field.evidence import Seen
+from tab_marl.field.answers.evidence import Seen
 from tab_marl.world.grid import GridMap
 from tab_marl.world.scenario import Scenario
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from tab_marl.field.posterior import Posterior
+    from tab_marl.field.answers.posterior import Posterior
     from tab_marl.field.tab_field import TabField
     from tab_marl.world.regions import Region
 

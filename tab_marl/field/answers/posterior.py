@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.field import kernels, smoothing_kernels
+from tab_marl.field import kernels
+from tab_marl.field.answers import smoothing_kernels
+from tab_marl.field.answers.evidence import ImpossibleEvidence, NearZeroEvidence, Observation
 from tab_marl.field.belief import BeliefOptions, ProductBelief
-from tab_marl.field.evidence import ImpossibleEvidence, NearZeroEvidence, Observation
 
 if TYPE_CHECKING:
-    from tab_marl.field.events import Event
+    from tab_marl.field.constraints.events import Event
     from tab_marl.field.tab_field import TabField
 
 Floats = NDArray[np.float64]

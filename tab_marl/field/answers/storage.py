@@ -17,14 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
-from tab_marl.field.constraints import Tilt
-from tab_marl.field.events import Tracker
+from tab_marl.field.constraints.events import Tracker
+from tab_marl.field.constraints.report import ConstraintFit, FitReport
+from tab_marl.field.constraints.tilt import Tilt
+from tab_marl.field.constraints.tracking import TrackedAutomaton, Tracking
 from tab_marl.field.infeasible import InfeasibleField
 from tab_marl.field.problem import FieldOptions, FieldProblem
 from tab_marl.field.reference import Reference
-from tab_marl.field.report import ConstraintFit, FitReport
 from tab_marl.field.tab_field import TabField
-from tab_marl.field.tracking import TrackedAutomaton, Tracking
 from tab_marl.mission.serialise import mission_from_json, mission_to_json
 from tab_marl.mission.unroll import TickAutomaton
 from tab_marl.world.grid import GridMap

@@ -43,6 +43,5 @@ def best_ahead(q, symbol_of, delta, log_weight, indptr, indices, log_data, best,
             following = indices[k]
             symbol = symbol_of[following]
             here = log_data[k] + log_weight[q, symbol] + best[delta[q, symbol], following]
-            if here > top:
-                top = here
+            top = max(top, here)
         out[s] = top

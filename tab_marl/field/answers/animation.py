@@ -36,7 +36,7 @@ def check_film(path: str | Path) -> None:
 
 def animate_field(field: TabField, path: str | Path, frames_per_second: int = 8) -> int:
     """See `TabField.animate`. Raises FilmError, OSError."""
-    from tab_marl.field.drawing import occupancy_frames
+    from tab_marl.field.answers.drawing import occupancy_frames
 
     if frames_per_second < 1:
         raise FilmError(f"frames_per_second is {frames_per_second}, must be >= 1")

@@ -1,0 +1,1 @@
+"""What a solved field tells: evidence, paths, stages, files, pictures."""

@@ -1,0 +1,1 @@
+"""The passes over (automaton state, base state): where they go, how they are computed."""
