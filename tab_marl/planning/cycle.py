@@ -47,9 +47,10 @@ def play(
     rng: np.random.Generator | int,
     max_steps: int = 100,
 ) -> Game:
-    """Plays from the hidden state `start` ([D]; for a model in plain Python any object) until the process ends or `max_steps` were done.
+    """Plays from the hidden state `start` until the process ends or `max_steps` were done.
 
-    `model` is the world: a `CompiledModel`, a `ContinuousModel` or a plain Python one; it need not be the planner's.
+    `start` is [D] numbers, or for a model in plain Python any object. `model` is the world: a `CompiledModel`, a `ContinuousModel`
+    or a plain Python one; it need not be the planner's.
     ``choose(belief, rng) -> action`` sees the belief alone, ``update(belief, action, observation) -> belief`` follows it; with a
     filter that is ``lambda belief, a, o: belief.update(a, o)``, with a planner
     ``lambda belief, rng: planner.plan(belief, rng).action``. The observation of the step that ends the process is recorded as the
