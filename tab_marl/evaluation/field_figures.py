@@ -11,9 +11,11 @@ import pandas as pd
 from tab_marl.evaluation.field_study import LEVEL
 
 CEILING = "knows the population"
-SHOWN = (
-    "walk", "walk + goals + timing", "tumble + goals", "drive + goals", "particles", "marginal kernel", "FP", "MLE", CEILING,
-)  # fmt: skip
+SHOWN = {
+    "walk": "#9aa3ad", "tumble + goals": "#7fa7d6", "tumble 0.5 m + goals": "#1f6feb", "drive + goals": "#c98a2b",
+    "particles": "#5fb0a5", "marginal kernel": "#b07cc6", "FP": "#d1495b", "MLE": "#8d6e63", CEILING: "#111111",
+}  # fmt: skip
+"""Models in the figure, all scored on every task, and their colours."""
 RESAMPLES = 2000
 
 
@@ -109,22 +111,21 @@ def _figure(scored: pd.DataFrame, path: Path) -> None:
     """Left: log-score by seconds ahead, from the start and after watching. Right: how often the 90 % set holds."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10.5, 4.2), layout="constrained")
+    figure = Figure(figsize=(10.5, 4.4), layout="constrained")
     axes = figure.subplots(1, 3)
-    colours = dict(zip(SHOWN, ["#9aa3ad", "#c98a2b", "#7fa7d6", "#1f6feb", "#5fb0a5", "#b07cc6", "#d1495b", "#8d6e63", "#111111"], strict=True))  # fmt: skip
     for axis, watched, title in ((axes[0], 0.0, "from the start"), (axes[1], 5.0, "after 5 s of cameras")):
-        for name in SHOWN:
+        for name, colour in SHOWN.items():
             own = scored[(scored.model == name) & (scored.watched == watched)]
             points = [(ahead, _mean(part)) for ahead, part in own.groupby("ahead")]
             style = "--" if name == CEILING else "-"
-            axis.plot(*zip(*points, strict=True), style, marker="o", color=colours[name], label=name, lw=1.8, ms=4)
+            axis.plot(*zip(*points, strict=True), style, marker="o", color=colour, label=name, lw=1.8, ms=4)
         axis.set(title=title, xlabel="seconds ahead", ylabel="log-likelihood, nats" if watched == 0 else "")
         axis.set_xticks([2, 5, 10])
     axes[2].axhline(LEVEL, color="#111111", lw=0.8, ls=":")
-    for name in SHOWN:
+    for name, colour in SHOWN.items():
         own = scored[(scored.model == name) & (scored.watched == 0.0)]
         points = [(ahead, _mean(part, "covered")) for ahead, part in own.groupby("ahead")]
-        axes[2].plot(*zip(*points, strict=True), "--" if name == CEILING else "-", marker="o", color=colours[name], lw=1.8, ms=4)  # fmt: skip
+        axes[2].plot(*zip(*points, strict=True), "--" if name == CEILING else "-", marker="o", color=colour, lw=1.8, ms=4)  # fmt: skip
     axes[2].set(title="in the 90 % set, from the start", xlabel="seconds ahead", ylim=(0, 1))
     axes[2].set_xticks([2, 5, 10])
     for axis in axes:

@@ -19,7 +19,10 @@ from tab_marl.mission.tasks import sample_task
 
 PLANNED: Mapping[str, FieldOptions] = {
     "paper walk, marginal kernel": replace(FIELDS["paper walk"], kernel="marginal"),
-    **{name: FIELDS[name] for name in ("walk", "tumble + goals", "drive + goals", "drive 0.5 m + goals")},
+    **{
+        name: FIELDS[name]
+        for name in ("walk", "tumble 0.5 m + goals", "tumble + goals", "drive 0.5 m + goals", "drive + goals")
+    },
 }
 """The paper's letter, the literal field, and the repairs."""
 

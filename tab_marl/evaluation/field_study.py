@@ -47,15 +47,16 @@ SAMPLES = 2000
 """Of models that can only sample."""
 PACES = (0.55, 0.75, 1.0)
 
-DEFAULT = FieldOptions(reference="drive_and_turn")
+VARIED = FieldOptions(reference="drive_and_turn", mean_run_metres=1.0)
+"""The field of which the filter, the kernel and the pace are varied."""
 
 
 def _fields() -> Iterator[tuple[str, FieldOptions]]:
     yield "paper walk", FieldOptions(reference="paper_walk", goal_marginals=False)
     for name, motion in {
         "walk": FieldOptions(reference="walk"),
-        "tumble": FieldOptions(reference="run_and_tumble"),
-        "drive": FieldOptions(reference="drive_and_turn"),
+        "tumble": FieldOptions(reference="run_and_tumble", mean_run_metres=1.0),
+        "drive": VARIED,
     }.items():
         yield name, replace(motion, goal_marginals=False)
         yield f"{name} + goals", motion
@@ -63,14 +64,14 @@ def _fields() -> Iterator[tuple[str, FieldOptions]]:
         yield f"{name} + goals + timing", replace(motion, timing_prior=True)
     yield "unicycle + goals", FieldOptions(reference="unicycle")
     yield "tumble 0.5 m + goals", FieldOptions(reference="run_and_tumble", mean_run_metres=0.5)
-    yield "drive 0.5 m + goals", replace(DEFAULT, mean_run_metres=0.5)
-    yield "drive 2 m + goals", replace(DEFAULT, mean_run_metres=2.0)
+    yield "drive 0.5 m + goals", replace(VARIED, mean_run_metres=0.5)
+    yield "drive 2 m + goals", replace(VARIED, mean_run_metres=2.0)
 
 
 FIELDS = dict(_fields())
 """Literal maximum entropy and each repair, alone and together."""
 OTHERS = ("particles", "marginal kernel", "pace latent", "S", "FP", "MLE", "knows the population")
-"""Of the default field: filtered by 2,000 particles, moved by its marginals as in the paper, a mixture over paces fixed per
+"""Of `drive + goals`: filtered by 2,000 particles, moved by its marginals as in the paper, a mixture over paces fixed per
 trajectory. Then the rivals' models, and a kernel estimate from the policies' own rollouts."""
 
 
@@ -185,11 +186,11 @@ class _Blank:
         if self.name in FIELDS:
             return [FieldModel(scenario, mission, FIELDS[self.name])]
         if self.name == "marginal kernel":
-            return [FieldModel(scenario, mission, replace(DEFAULT, kernel="marginal"))]
+            return [FieldModel(scenario, mission, replace(VARIED, kernel="marginal"))]
         if self.name == "pace latent":
             return list(_at_paces(scenario, self.task))
         if self.name == "particles":
-            field = FieldModel(scenario, mission, DEFAULT).field
+            field = FieldModel(scenario, mission, VARIED).field
             drawn = sample_paths(field.chain, field.belief(), self.rng, SAMPLES, scenario.horizon_ticks)
             return [TrajectoryPool(scenario, drawn.positions, drawn.completed_tick)]
         if self.name == "knows the population":
@@ -228,7 +229,7 @@ def _at_paces(scenario: Scenario, task: Task) -> Iterator[FieldModel]:
     for pace in PACES:
         slower = replace(scenario.adversary, max_speed=pace * scenario.adversary.max_speed)
         try:
-            yield FieldModel(replace(scenario, adversary=slower), task.mission, DEFAULT)
+            yield FieldModel(replace(scenario, adversary=slower), task.mission, VARIED)
         except InfeasibleField:
             continue
 
