@@ -155,7 +155,7 @@ def begin_many(bank, duel, which, task, start, full, robots, location, clocks, m
         write_adversary(bank, duel, k, robots[i], location[i], clocks[i], memory[i], adversary_out[i])
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def step_many(
     bank, duel, task, ego_action, adversary_action, end_on_completion, full, robots, location, clocks, memory, counter,
     reward, terminated, truncated, event, ego_out, adversary_out,

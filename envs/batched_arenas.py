@@ -9,7 +9,10 @@ only) yield to each other by halves, which is not what pymunk does.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -77,13 +80,17 @@ class BatchedArenas:
         full_observation: bool = False,
         max_cycles: int | None = None,
         adversary_rewards: AdversaryRewards | None = None,
+        workers: int = 1,
     ) -> None:
-        """`tasks` are drawn from by `begin`; the other arguments are `InterceptEnv`'s.
+        """`tasks` are drawn from by `begin`; `workers` threads share the arenas, with the same outcome for any number of
+        them; the other arguments are `InterceptEnv`'s.
 
         Raises ValueError if the tasks' egos observe different things.
         """
         if arenas < 1:
             raise ValueError(f"the number of arenas is {arenas}, must be >= 1")
+        if workers < 1:
+            raise ValueError(f"workers is {workers}, must be >= 1")
         self.bank = Bank.of(tasks)
         self.arenas = arenas
         rows = {tuple(row.name for row in ego_rows(task.scenario)) for task in tasks}
@@ -107,6 +114,8 @@ class BatchedArenas:
         self._counter = np.zeros((arenas, k.COUNTERS), dtype=np.int64)
         self._ego = np.zeros((arenas, self.observed_by_ego), dtype=np.float32)
         self._adversary = np.zeros((arenas, OBSERVED), dtype=np.float32)
+        cuts = np.linspace(0, arenas, min(workers, arenas) + 1).round().astype(int).tolist()
+        self._shares = [slice(a, b) for a, b in pairwise(cuts)]
 
     @property
     def steps(self) -> NDArray[np.int64]:
@@ -150,14 +159,28 @@ class BatchedArenas:
         n = self.arenas
         rewards, events = np.empty((n, 2)), np.empty((n, k.EVENTS))
         terminated, truncated = np.empty(n, dtype=bool), np.empty(n, dtype=bool)
-        k.step_many(
-            self.bank.tables, self._duels, self.task, given[0], given[1], self._end_on_completion, self._full,
-            self.robots, self.location, self.clocks, self._memory, self._counter, rewards, terminated, truncated,
-            events, self._ego, self._adversary,
-        )  # fmt: skip
+
+        def share(rows: slice) -> None:
+            k.step_many(
+                self.bank.tables, self._duels, self.task[rows], given[0][rows], given[1][rows], self._end_on_completion,
+                self._full, self.robots[rows], self.location[rows], self.clocks[rows], self._memory[rows],
+                self._counter[rows], rewards[rows], terminated[rows], truncated[rows], events[rows], self._ego[rows],
+                self._adversary[rows],
+            )  # fmt: skip
+
+        if len(self._shares) == 1:
+            share(self._shares[0])
+        else:
+            list(_threads(len(self._shares)).map(share, self._shares))
         return Outcome(
             self._ego.copy(), self._adversary.copy(), rewards, terminated, truncated, events.astype(bool)
         )  # fmt: skip
+
+
+@lru_cache(maxsize=8)
+def _threads(count: int) -> ThreadPoolExecutor:
+    """Kept, since a step is shorter than a thread's start."""
+    return ThreadPoolExecutor(count, "arenas")
 
 
 def draw_bank(source: TaskSource, count: int, style: Style, rng: np.random.Generator) -> list[AdversaryTask]:

@@ -65,13 +65,15 @@ class BatchedEnv(VectorEnv[Array, Array, NDArray[Any]]):
         task: Task | TaskSource | None = None,
         mission: str | Mission = "M1",
         scenario: str | Scenario = "lab",
+        workers: int = 1,
         **drawn: Any,
     ) -> None:
         """`side`: "ego" or "adversary", who learns. `opponent`: a scripted player's name (see `opponents`), or an object
         with ``act`` or a function that takes observations ``[N, D]`` and gives actions ``[N, 2]``, such as a zoo policy or
         a frozen copy of the learner. `tasks`: how many tasks are drawn once, at the first reset, and played over and over
-        (default: 64 where there is something to draw). `task`, `mission`, `scenario` and what else says what is played (`family`,
-        `sampled`, `difficulty`, `curriculum`, `ego_task`, `adversary_sees_ego_metres`): see `task_source`. The rest is
+        (default: 64 where there is something to draw). `workers`: threads that share the arenas; the episodes are the
+        same. `task`, `mission`, `scenario` and what else says what is played (`family`, `sampled`, `difficulty`,
+        `curriculum`, `ego_task`, `adversary_sees_ego_metres`): see `task_source`. The rest is
         `InterceptEnv`'s.
         """
         if side not in ("ego", "adversary"):
@@ -94,6 +96,7 @@ class BatchedEnv(VectorEnv[Array, Array, NDArray[Any]]):
             "full_observation": full_observation,
             "max_cycles": max_cycles,
             "adversary_rewards": adversary_rewards,
+            "workers": workers,
         }
         self.single_observation_space = ego_space(self._shape_of) if side == "ego" else adversary_space()
         self.single_action_space = Box(-1.0, 1.0, (2,), dtype=np.float32)

@@ -108,12 +108,12 @@ def test_contact_costs_what_it_costs_in_the_environment(reach_a) -> None:
 
 
 def test_arenas_do_not_disturb_each_other() -> None:
-    """A batch plays what its arenas play alone."""
+    """A batch, shared by several threads, plays what its arenas play alone."""
     tasks = [sample_task(np.random.default_rng(i), mission, "point") for i, mission in enumerate(("M1", "M4", "M5"))]
     built = [AdversaryTask.build(t.scenario, t.mission, Style(), np.random.default_rng(0)) for t in tasks]
     rng = np.random.default_rng(0)
     actions = rng.uniform(-1, 1, (40, 2, 6, 2)).astype(np.float32)
-    together = BatchedArenas(built, 6)
+    together = BatchedArenas(built, 6, workers=4)
     order = np.array([0, 1, 2, 2, 1, 0])
     together.begin(np.arange(6), np.random.default_rng(1), tasks=order)
     starts = together.robots[:, :, :3].copy()
@@ -126,6 +126,12 @@ def test_arenas_do_not_disturb_each_other() -> None:
             np.testing.assert_array_equal(outcome.ego[0], found[t].ego[i])
             np.testing.assert_array_equal(outcome.adversary[0], found[t].adversary[i])
             assert outcome.rewards[0].tolist() == found[t].rewards[i].tolist()
+
+
+def test_there_is_at_least_one_worker(reach_a) -> None:
+    built = AdversaryTask.build(reach_a.scenario, reach_a.mission, Style(), np.random.default_rng(0))
+    with pytest.raises(ValueError, match="workers is 0, must be >= 1"):
+        BatchedArenas([built], 2, workers=0)
 
 
 def test_bodies_that_touch_do_not_pass(mixed, reach_a) -> None:
