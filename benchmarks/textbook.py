@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from tab_marl.planning import Despot, DespotOptions, Particles, Pomcp, PomcpOptions, Pomcpow, PomcpowOptions
+from tab_marl.planning.beliefs.particle_filter import FilterOptions, ParticleFilter
 from tab_marl.planning.cycle import play
-from tab_marl.planning.particle_filter import FilterOptions, ParticleFilter
 from tab_marl.planning.textbook import (
     LaserTagBelief,
     RockBelief,

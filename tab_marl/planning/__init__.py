@@ -6,19 +6,19 @@
 
 from __future__ import annotations
 
-from tab_marl.planning.belief import BeliefDepleted, update_particles
+from tab_marl.planning.beliefs.belief import BeliefDepleted, update_particles
+from tab_marl.planning.beliefs.exact_filter import ExactFilter
+from tab_marl.planning.beliefs.filter_report import BeliefWarning, FilterReport, ImpossibleObservation
+from tab_marl.planning.beliefs.particle_filter import FilterOptions, ParticleFilter
 from tab_marl.planning.cycle import Game, play
-from tab_marl.planning.despot import Despot, DespotOptions
-from tab_marl.planning.exact_filter import ExactFilter
-from tab_marl.planning.explanation import Explanation
-from tab_marl.planning.filter_report import BeliefWarning, FilterReport, ImpossibleObservation
 from tab_marl.planning.model import CompiledModel, ContinuousModel, Particles, PlainPythonWarning, PythonModel
-from tab_marl.planning.particle_filter import FilterOptions, ParticleFilter
-from tab_marl.planning.plan import Plan, Planner
-from tab_marl.planning.pomcp import Pomcp, PomcpOptions
-from tab_marl.planning.pomcpow import Pomcpow, PomcpowOptions
+from tab_marl.planning.search.despot import Despot, DespotOptions
+from tab_marl.planning.search.explanation import Explanation
+from tab_marl.planning.search.plan import Plan, Planner
+from tab_marl.planning.search.pomcp import Pomcp, PomcpOptions
+from tab_marl.planning.search.pomcpow import Pomcpow, PomcpowOptions
+from tab_marl.planning.search.tree import SearchTree
 from tab_marl.planning.tables import table_model
-from tab_marl.planning.tree import SearchTree
 
 __all__ = [
     "BeliefDepleted",

@@ -20,7 +20,7 @@
 of data and cached on disk, so keep dtypes, dimensions and memory order the same from call to call, and let arrays be writable
 and C-contiguous. `rng` is uint64[1] for `tab_marl.planning.random_kernels`. Return ``np.int64`` observations, float rewards, bool terminals.
 
-**Continuous observations** (`ContinuousModel`, for `tab_marl.planning.pomcpow.Pomcpow`): compiled functions again, but
+**Continuous observations** (`ContinuousModel`, for `tab_marl.planning.search.pomcpow.Pomcpow`): compiled functions again, but
 
 ``step(state, action, data, rng, observation) -> (reward, terminal)``
     Changes `state` and writes into `observation`, float64[O].

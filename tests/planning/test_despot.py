@@ -11,8 +11,8 @@ import pytest
 
 from tab_marl.planning import Despot, DespotOptions, Particles, textbook
 from tab_marl.planning.model import PlainPythonWarning
+from tab_marl.planning.search.tree import ROOT
 from tab_marl.planning.tables import table_model
-from tab_marl.planning.tree import ROOT
 
 heavy = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="takes hours interpreted")
 TIGER = {"reward_bounds": (-100.0, 10.0), "scenarios": 60, "trials": 25, "max_depth": 10}
@@ -153,7 +153,7 @@ def test_time_and_memory_are_bounded():
 
 @heavy
 def test_the_tree_does_not_depend_on_how_often_the_arrays_grew(monkeypatch, same_tree):
-    from tab_marl.planning import despot
+    from tab_marl.planning.search import despot
 
     planner = Despot(textbook.tag(), DespotOptions(scenarios=30, trials=20))
     whole = planner.plan(tag_belief(), 8)

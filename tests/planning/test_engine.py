@@ -16,8 +16,8 @@ import scipy.sparse
 from tab_marl.planning import Despot, DespotOptions, Pomcp, PomcpOptions, textbook
 from tab_marl.planning.model import CompiledModel, PlainPythonWarning
 from tab_marl.planning.random_kernels import below
+from tab_marl.planning.search.tree import ROOT
 from tab_marl.planning.tables import table_model
-from tab_marl.planning.tree import ROOT
 
 heavy = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="takes hours interpreted")
 

@@ -12,7 +12,7 @@ import pytest
 from scipy.optimize import linprog
 
 from tab_marl.planning.model import Particles
-from tab_marl.planning.pomcp import Pomcp, PomcpOptions
+from tab_marl.planning.search.pomcp import Pomcp, PomcpOptions
 from tab_marl.planning.tables import table_model
 from tab_marl.planning.textbook import tiger
 

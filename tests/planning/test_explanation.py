@@ -10,12 +10,12 @@ import pytest
 from rich.console import Console
 
 from tab_marl.planning import textbook
-from tab_marl.planning.exact_filter import ExactFilter
-from tab_marl.planning.explanation import summarise
+from tab_marl.planning.beliefs.exact_filter import ExactFilter
 from tab_marl.planning.model import Particles
-from tab_marl.planning.pomcp import Pomcp, PomcpOptions
+from tab_marl.planning.search.explanation import summarise
+from tab_marl.planning.search.pomcp import Pomcp, PomcpOptions
+from tab_marl.planning.search.tree import ROOT
 from tab_marl.planning.tables import table_model
-from tab_marl.planning.tree import ROOT
 
 GROWLS = ("growl left", "growl right").__getitem__
 

@@ -11,10 +11,10 @@ import pytest
 import scipy.sparse
 
 from tab_marl.planning import table_kernels, textbook
-from tab_marl.planning.exact_filter import ExactFilter
-from tab_marl.planning.filter_report import BeliefWarning, ImpossibleObservation
+from tab_marl.planning.beliefs.exact_filter import ExactFilter
+from tab_marl.planning.beliefs.filter_report import BeliefWarning, ImpossibleObservation
+from tab_marl.planning.beliefs.particle_filter import FilterOptions, ParticleFilter
 from tab_marl.planning.model import CompiledModel, Particles
-from tab_marl.planning.particle_filter import FilterOptions, ParticleFilter
 from tab_marl.planning.random_kernels import normal
 from tab_marl.planning.tables import table_model
 

@@ -8,12 +8,13 @@ import numba
 import numpy as np
 import pytest
 
-from tab_marl.planning import growing, textbook
+from tab_marl.planning import textbook
 from tab_marl.planning.model import CompiledModel, Particles
-from tab_marl.planning.pomcp import Pomcp, PomcpOptions
 from tab_marl.planning.random_kernels import uniform
+from tab_marl.planning.search import growing
+from tab_marl.planning.search.pomcp import Pomcp, PomcpOptions
+from tab_marl.planning.search.tree import NO_PARENT, ROOT
 from tab_marl.planning.tables import table_model
-from tab_marl.planning.tree import NO_PARENT, ROOT
 
 heavy = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="takes hours interpreted")
 

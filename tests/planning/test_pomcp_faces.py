@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from tab_marl.planning import textbook
-from tab_marl.planning.belief import BeliefDepleted, update_particles
+from tab_marl.planning.beliefs.belief import BeliefDepleted, update_particles
 from tab_marl.planning.model import CompiledModel, Particles
-from tab_marl.planning.pomcp import Pomcp, PomcpOptions
 from tab_marl.planning.random_kernels import uniform
+from tab_marl.planning.search.pomcp import Pomcp, PomcpOptions
+from tab_marl.planning.search.tree import ROOT
 from tab_marl.planning.tables import table_model
-from tab_marl.planning.tree import ROOT
 
 heavy = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="takes hours interpreted")
 
@@ -200,7 +200,8 @@ def test_a_plan_explains_itself():
 @heavy
 def test_a_second_process_finds_the_compiled_search_on_disk():
     program = (
-        "from tab_marl.planning import kernels, textbook; from tab_marl.planning.pomcp import Pomcp, PomcpOptions;"
+        "from tab_marl.planning import textbook; from tab_marl.planning.search import kernels;"
+        "from tab_marl.planning.search.pomcp import Pomcp, PomcpOptions;"
         "Pomcp(textbook.tag(), PomcpOptions(simulations=10)).plan([[0, 1]], 0);"
         "print(sum(kernels.search.stats.cache_hits.values()), sum(kernels.search.stats.cache_misses.values()))"
     )

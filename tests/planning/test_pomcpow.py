@@ -11,11 +11,11 @@ import pytest
 
 from tab_marl.planning import ContinuousModel, Particles, Pomcpow, PomcpowOptions, textbook
 from tab_marl.planning.model import PlainPythonWarning
+from tab_marl.planning.search.tree import ROOT
 from tab_marl.planning.table_kernels import draw
 from tab_marl.planning.tables import table_model
 from tab_marl.planning.textbook import light_dark_kernels
 from tab_marl.planning.textbook.light_dark import light_dark_data, light_dark_start
-from tab_marl.planning.tree import ROOT
 
 heavy = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="takes hours interpreted")
 
@@ -138,7 +138,7 @@ def test_without_widening_every_observation_is_a_node_of_its_own():
 
 @heavy
 def test_the_tree_does_not_depend_on_how_often_the_arrays_grew(monkeypatch, same_tree):
-    from tab_marl.planning import pomcpow
+    from tab_marl.planning.search import pomcpow
 
     planner = Pomcpow(LIGHT_DARK, PomcpowOptions(simulations=1500, exploration=90.0))
     whole = planner.plan(START, 8)

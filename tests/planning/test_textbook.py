@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from tab_marl.planning import random_kernels, textbook
-from tab_marl.planning.interpreted import mixed
-from tab_marl.planning.pomcp import Pomcp, PomcpOptions
+from tab_marl.planning.search.interpreted import mixed
+from tab_marl.planning.search.pomcp import Pomcp, PomcpOptions
 from tab_marl.planning.textbook import EAST, NORTH, SEES_TARGET, TAG, WEST, TagBelief, play_tag, tag, tag_data
 
 MAP = """

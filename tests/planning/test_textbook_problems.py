@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tab_marl.planning.cycle import play
-from tab_marl.planning.pomcp import Pomcp, PomcpOptions
+from tab_marl.planning.search.pomcp import Pomcp, PomcpOptions
 from tab_marl.planning.textbook import laser_tag as laser_tag_function
 from tab_marl.planning.textbook import light_dark_binned, light_dark_start, rock_sample
 from tab_marl.planning.textbook import rock_sample_kernels as rocks

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from tab_marl.planning.model import CompiledModel
 from tab_marl.planning.models.interface import SampledPaths
-from tab_marl.planning.pomcp import Plan, Pomcp, PomcpOptions
 from tab_marl.planning.pursuit import decide_kernels, interception_kernels
 from tab_marl.planning.pursuit.interception import RouteValues
 from tab_marl.planning.pursuit.itineraries import Geometry, Pose, PursuitOptions, geometry_of, shortlist
 from tab_marl.planning.pursuit.routes import Itinerary, RouteMap
 from tab_marl.planning.pursuit.tasks import weighed
+from tab_marl.planning.search.pomcp import Plan, Pomcp, PomcpOptions
 from tab_marl.world.scenario import Scenario
 
 TRIED_SHARE = 0.3

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
 
-from tab_marl.planning.filter_report import Deprivation, EventLog, FilterReport, ImpossibleObservation, named
+from tab_marl.planning.beliefs.filter_report import Deprivation, EventLog, FilterReport, ImpossibleObservation, named
 from tab_marl.planning.model import CompiledModel, Particles, action_names
 from tab_marl.planning.tables import SparseData, SparseRows, TableData
 

@@ -1,6 +1,6 @@
 """The search in plain Python: for models that are Python classes, for debugging compiled ones, and as the kernel's slow twin.
 
-Given a `CompiledModel` it draws the same random numbers as `tab_marl.planning.kernels.search` and must build the identical tree.
+Given a `CompiledModel` it draws the same random numbers as `tab_marl.planning.search.kernels.search` and must build the identical tree.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.planning.growing import merged, particle_blocks, shares
-from tab_marl.planning.kernels import NO_CHILD, UNEXPANDED
 from tab_marl.planning.model import CompiledModel, belief_objects, belief_states
-from tab_marl.planning.plan import Search
-from tab_marl.planning.tree import EDGE, NODE, ROOT, SearchTree
+from tab_marl.planning.search.growing import merged, particle_blocks, shares
+from tab_marl.planning.search.kernels import NO_CHILD, UNEXPANDED
+from tab_marl.planning.search.plan import Search
+from tab_marl.planning.search.tree import EDGE, NODE, ROOT, SearchTree
 
 if TYPE_CHECKING:
-    from tab_marl.planning.pomcp import PomcpOptions
+    from tab_marl.planning.search.pomcp import PomcpOptions
 
 _MASK = 2**64 - 1
 _GOLDEN = 0x9E3779B97F4A7C15

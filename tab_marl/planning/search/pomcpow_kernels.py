@@ -1,6 +1,6 @@
 # mypy: ignore-errors
-"""The compiled POMCPOW search. Nothing here raises; `tab_marl.planning.pomcpow` validates, and
-`tab_marl.planning.pomcpow_interpreted` is the slow twin that must build the identical tree.
+"""The compiled POMCPOW search. Nothing here raises; `tab_marl.planning.search.pomcpow` validates, and
+`tab_marl.planning.search.pomcpow_interpreted` is the slow twin that must build the identical tree.
 
 Every node but the root keeps a belief: weighted particles (state, reward of the step that led there) side by side in a pool, with
 cumulative weights; when its place is full, the belief moves to one twice as large at the pool's end.
@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from tab_marl.planning.kernels import NO_CHILD, UNEXPANDED, select
 from tab_marl.planning.random_kernels import below, uniform
+from tab_marl.planning.search.kernels import NO_CHILD, UNEXPANDED, select
 
 # What `used` counts; BROKEN is set where a likelihood was no number >= 0, or 0 for the very observation that step wrote.
 NODES, EDGES, ROWS, DEEPEST, STEPS, LARGEST, BROKEN = range(7)

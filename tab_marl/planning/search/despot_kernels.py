@@ -1,6 +1,6 @@
 # mypy: ignore-errors
-"""The compiled scenario search (DESPOT). Nothing here raises; `tab_marl.planning.despot` validates, and
-`tab_marl.planning.despot_interpreted` is the slow twin that must build the identical tree.
+"""The compiled scenario search (DESPOT). Nothing here raises; `tab_marl.planning.search.despot` validates, and
+`tab_marl.planning.search.despot_interpreted` is the slow twin that must build the identical tree.
 
 A node holds the scenarios that reach it, as rows (state, scenario number) stored side by side. All bounds are *totals*: sums
 over the scenarios of discounted returns, divided by K, so that bounds of children add up (Ye et al. 2017, equations 9 to 14).
@@ -13,8 +13,8 @@ import math
 import numpy as np
 from numba import njit
 
-from tab_marl.planning.kernels import NO_CHILD, UNEXPANDED
 from tab_marl.planning.random_kernels import GOLDEN, below, mixed
+from tab_marl.planning.search.kernels import NO_CHILD, UNEXPANDED
 
 # What `used` counts.
 NODES, EDGES, ROWS, TRIALS, EXPANSIONS, AT, GREW, STEPS, DEEPEST = range(9)

@@ -18,13 +18,13 @@ from weakref import WeakSet
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.planning import kernels, merge_kernels
 from tab_marl.planning.model import CompiledModel, belief_states, draw_particles
-from tab_marl.planning.plan import Search
-from tab_marl.planning.tree import SearchTree
+from tab_marl.planning.search import kernels, merge_kernels
+from tab_marl.planning.search.plan import Search
+from tab_marl.planning.search.tree import SearchTree
 
 if TYPE_CHECKING:
-    from tab_marl.planning.pomcp import PomcpOptions
+    from tab_marl.planning.search.pomcp import PomcpOptions
 
 BLOCK = 2048
 """Simulations whose particles are drawn at a time: the same with a time budget and without, so that both grow one tree."""

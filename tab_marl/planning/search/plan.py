@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tab_marl.planning.explanation import Explanation, brief, explain
 from tab_marl.planning.model import action_names
-from tab_marl.planning.tree import ROOT, SearchTree
+from tab_marl.planning.search.explanation import Explanation, brief, explain
+from tab_marl.planning.search.tree import ROOT, SearchTree
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -65,8 +65,8 @@ class Plan:
         return explain(self, belief, name_of)
 
     def draw(self, path: str | Path | None = None, **options: Any) -> Figure:
-        """The tree as a picture (.svg, .png, .pdf); options of `tab_marl.planning.drawing.draw_plan`."""
-        from tab_marl.planning.drawing import draw_plan
+        """The tree as a picture (.svg, .png, .pdf); options of `tab_marl.planning.search.drawing.draw_plan`."""
+        from tab_marl.planning.search.drawing import draw_plan
 
         return draw_plan(self, path, **options)
 

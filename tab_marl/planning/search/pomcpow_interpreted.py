@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tab_marl.planning.growing import merged, particle_blocks, shares
-from tab_marl.planning.interpreted import Stream, mixed
-from tab_marl.planning.kernels import NO_CHILD, UNEXPANDED
 from tab_marl.planning.model import ContinuousModel, belief_objects, belief_states
-from tab_marl.planning.plan import Search, Stopped
-from tab_marl.planning.pomcpow_kernels import FIRST_ROOM
-from tab_marl.planning.tree import EDGE, NODE, ROOT, SearchTree
+from tab_marl.planning.search.growing import merged, particle_blocks, shares
+from tab_marl.planning.search.interpreted import Stream, mixed
+from tab_marl.planning.search.kernels import NO_CHILD, UNEXPANDED
+from tab_marl.planning.search.plan import Search, Stopped
+from tab_marl.planning.search.pomcpow_kernels import FIRST_ROOM
+from tab_marl.planning.search.tree import EDGE, NODE, ROOT, SearchTree
 
 if TYPE_CHECKING:
-    from tab_marl.planning.pomcpow import PomcpowOptions
+    from tab_marl.planning.search.pomcpow import PomcpowOptions
 
 _MASK = 2**64 - 1
 _GOLDEN = 0x9E3779B97F4A7C15
@@ -129,7 +129,7 @@ class _Search:
     def weight(self, before: Any, action: int, after: Any, seen: Any, own: bool) -> float:
         weight = self.source.likelihood(before, action, after, seen)
         if not (weight > 0.0 if own else weight >= 0.0) or not weight < math.inf:
-            from tab_marl.planning.pomcpow import raise_likelihood
+            from tab_marl.planning.search.pomcpow import raise_likelihood
 
             raise_likelihood()
         return float(weight)

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.planning import kernels
 from tab_marl.planning.model import CompiledModel, belief_states, draw_particles
+from tab_marl.planning.search import kernels
 
 
 class BeliefDepleted(RuntimeError):

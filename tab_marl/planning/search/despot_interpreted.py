@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.planning import despot_kernels as kernels
-from tab_marl.planning.interpreted import Stream, mixed
-from tab_marl.planning.kernels import NO_CHILD, UNEXPANDED
 from tab_marl.planning.model import CompiledModel, belief_objects, belief_states
-from tab_marl.planning.plan import Search, Stopped
+from tab_marl.planning.search import despot_kernels as kernels
+from tab_marl.planning.search.interpreted import Stream, mixed
+from tab_marl.planning.search.kernels import NO_CHILD, UNEXPANDED
+from tab_marl.planning.search.plan import Search, Stopped
 
 if TYPE_CHECKING:
-    from tab_marl.planning.despot import DespotOptions
+    from tab_marl.planning.search.despot import DespotOptions
 
 _MASK = 2**64 - 1
 _GOLDEN = 0x9E3779B97F4A7C15
@@ -254,7 +254,7 @@ def search_in_python(
     model: Any, options: DespotOptions, belief: Any, rng: np.random.Generator, root_actions: NDArray[np.int64]
 ) -> Search:
     """The search, interpreted."""
-    from tab_marl.planning.despot import DESPOT_EDGE, DESPOT_NODE, drawn_scenarios, finished, powers_of
+    from tab_marl.planning.search.despot import DESPOT_EDGE, DESPOT_NODE, drawn_scenarios, finished, powers_of
 
     numbered = isinstance(model, CompiledModel)
     source = (_CompiledSource if numbered else _PythonSource)(model, options, belief, rng)

@@ -11,7 +11,7 @@ import numpy as np
 from numba import typeof, types
 from numpy.typing import NDArray
 
-from tab_marl.planning import filter_kernels
+from tab_marl.planning.beliefs import filter_kernels
 from tab_marl.planning.callbacks import callback
 from tab_marl.planning.model import (
     CompiledModel,

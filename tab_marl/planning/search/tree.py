@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.planning.kernels import NO_CHILD, NO_SIBLING, UNEXPANDED, copy_subtree
+from tab_marl.planning.search.kernels import NO_CHILD, NO_SIBLING, UNEXPANDED, copy_subtree
 
 ROOT = 0
 NO_PARENT = -1

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Stepping and weighing the particles of a belief; `tab_marl.planning.particle_filter` decides what to do with the weights."""
+"""Stepping and weighing the particles of a belief; `tab_marl.planning.beliefs.particle_filter` decides what to do with the weights."""
 
 # mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators, no-check-untyped-defs
 

@@ -7,14 +7,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tab_marl.planning.explanation import NameOf, brief
-from tab_marl.planning.tree import ROOT
+from tab_marl.planning.search.explanation import NameOf, brief
+from tab_marl.planning.search.tree import ROOT
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from tab_marl.planning.plan import Plan
+    from tab_marl.planning.search.plan import Plan
 
 INK, SOFT, BEST, ACTION, HISTORY = "#1b1b1b", "#9aa1ab", "#c8553d", "#eef1f5", "#ffffff"
 

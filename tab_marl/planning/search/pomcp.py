@@ -15,12 +15,12 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tab_marl.planning.bounds import check_horizon, horizon_of, require
-from tab_marl.planning.growing import grow_tree_compiled
-from tab_marl.planning.interpreted import asked_prior, grow_tree_in_python
 from tab_marl.planning.model import CompiledModel, belief_states, check_model, check_numbered, warn_of_plain_python
-from tab_marl.planning.plan import Plan, action_numbers, decided
-from tab_marl.planning.tree import ROOT, SearchTree
+from tab_marl.planning.search.bounds import check_horizon, horizon_of, require
+from tab_marl.planning.search.growing import grow_tree_compiled
+from tab_marl.planning.search.interpreted import asked_prior, grow_tree_in_python
+from tab_marl.planning.search.plan import Plan, action_numbers, decided
+from tab_marl.planning.search.tree import ROOT, SearchTree
 
 __all__ = ["Plan", "Pomcp", "PomcpOptions"]
 

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tab_marl.planning.model import Particles
-from tab_marl.planning.tree import ROOT
+from tab_marl.planning.search.tree import ROOT
 
 if TYPE_CHECKING:
     from rich.console import Group
 
-    from tab_marl.planning.plan import Plan
+    from tab_marl.planning.search.plan import Plan
 
 NameOf: TypeAlias = Callable[[Any], str]
 """How to write an observation for people."""

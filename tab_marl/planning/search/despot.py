@@ -3,7 +3,7 @@
 A scenario is a start state and a stream of random numbers, so that a model's step becomes a function; K of them stand for the
 belief. The tree holds, for every history that some scenario meets, a lower bound (what the default policy earns there, or what
 was found better) and an upper bound; trials go where they are furthest apart. ``Despot(model, DespotOptions(...)).plan(belief,
-rng)`` returns the same `Plan` as `tab_marl.planning.pomcp.Pomcp`.
+rng)`` returns the same `Plan` as `tab_marl.planning.search.pomcp.Pomcp`.
 
 The default policy is the model's ``rollout`` (it must go by the history alone), or uniformly random actions. The upper bound is
 the model's ``upper``, or the greatest reward at every step, from ``reward_bounds``.
@@ -20,11 +20,6 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tab_marl.planning import despot_kernels as kernels
-from tab_marl.planning.bounds import check_horizon, horizon_of, require
-from tab_marl.planning.despot_interpreted import search_in_python
-from tab_marl.planning.growing import Chunks, grown, table_size
-from tab_marl.planning.kernels import UNEXPANDED
 from tab_marl.planning.model import (
     CompiledModel,
     belief_states,
@@ -33,8 +28,13 @@ from tab_marl.planning.model import (
     draw_particles,
     warn_of_plain_python,
 )
-from tab_marl.planning.plan import Plan, Search, Stopped, action_numbers, decided
-from tab_marl.planning.tree import EDGE, NODE, ROOT, SearchTree
+from tab_marl.planning.search import despot_kernels as kernels
+from tab_marl.planning.search.bounds import check_horizon, horizon_of, require
+from tab_marl.planning.search.despot_interpreted import search_in_python
+from tab_marl.planning.search.growing import Chunks, grown, table_size
+from tab_marl.planning.search.kernels import UNEXPANDED
+from tab_marl.planning.search.plan import Plan, Search, Stopped, action_numbers, decided
+from tab_marl.planning.search.tree import EDGE, NODE, ROOT, SearchTree
 
 _FIRST_EXPANSIONS = 8
 """Room allocated at first, in expansions of the root."""

@@ -3,7 +3,7 @@
 Where no observation is met twice, POMCP's nodes below the first step hold one state each, as if the agent then knew it: it plans
 as in QMDP and never pays for information. POMCPOW lets the observations of an action grow only as ``widening * n ** power``, and
 every simulation that comes to an observation adds its state there, weighted by how likely that observation was.
-``Pomcpow(model, PomcpowOptions(...)).plan(belief, rng)`` returns the same `Plan` as `tab_marl.planning.pomcp.Pomcp`; the model is
+``Pomcpow(model, PomcpowOptions(...)).plan(belief, rng)`` returns the same `Plan` as `tab_marl.planning.search.pomcp.Pomcp`; the model is
 a `ContinuousModel` or a Python class with ``likelihood``.
 """
 
@@ -18,9 +18,10 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tab_marl.planning import pomcpow_kernels as kernels
-from tab_marl.planning.bounds import check_horizon, horizon_of, require
-from tab_marl.planning.growing import (
+from tab_marl.planning.model import CompiledModel, ContinuousModel, belief_states, check_model, warn_of_plain_python
+from tab_marl.planning.search import pomcpow_kernels as kernels
+from tab_marl.planning.search.bounds import check_horizon, horizon_of, require
+from tab_marl.planning.search.growing import (
     INVERSE_ROOT,
     ROOT_LOG,
     Chunks,
@@ -31,10 +32,9 @@ from tab_marl.planning.growing import (
     run_all,
     shares,
 )
-from tab_marl.planning.model import CompiledModel, ContinuousModel, belief_states, check_model, warn_of_plain_python
-from tab_marl.planning.plan import Plan, Search, action_numbers, decided
-from tab_marl.planning.pomcpow_interpreted import search_in_python
-from tab_marl.planning.tree import Readings, SearchTree
+from tab_marl.planning.search.plan import Plan, Search, action_numbers, decided
+from tab_marl.planning.search.pomcpow_interpreted import search_in_python
+from tab_marl.planning.search.tree import Readings, SearchTree
 
 _FIRST_NODES = 4096
 _FIRST_ROWS = 32768

@@ -2,8 +2,8 @@
 """The compiled POMCP search: one function, compiled once per type of model data and cached on disk.
 
 The model enters as first-class function types (numba passes a pointer with a known signature), never as a jitted function or
-a closure, which would compile anew in every process. Nothing here raises; `tab_marl.planning.pomcp` validates, and
-`tab_marl.planning.interpreted` is the slow twin that must build the identical tree.
+a closure, which would compile anew in every process. Nothing here raises; `tab_marl.planning.search.pomcp` validates, and
+`tab_marl.planning.search.interpreted` is the slow twin that must build the identical tree.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators, no-check-untyped-defs

@@ -27,9 +27,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.planning.filter_report import Deprivation, EventLog, FilterReport, named
+from tab_marl.planning.beliefs.filter_report import Deprivation, EventLog, FilterReport, named
+from tab_marl.planning.beliefs.particle_dynamics import dynamics_of
 from tab_marl.planning.model import Particles, action_names, draw_particles
-from tab_marl.planning.particle_dynamics import dynamics_of
 
 Reinvigorate: TypeAlias = Callable[[NDArray[Any], np.random.Generator], NDArray[Any]]
 """``reinvigorate(states [n, D], rng) -> states [n, D]``: neighbours of these states, to keep the belief from thinning out."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from tab_marl.planning.kernels import EDGES, NO_CHILD, NODES, UNEXPANDED, enter, find_child
+from tab_marl.planning.search.kernels import EDGES, NO_CHILD, NODES, UNEXPANDED, enter, find_child
 
 
 @njit(cache=True, nogil=True)
