@@ -37,7 +37,7 @@ def example(monkeypatch: pytest.MonkeyPatch):
 
 def test_every_example_is_tested_and_short() -> None:
     names = {path.stem for path in FOLDER.glob("*.py")}
-    assert names == {"ppo_torch", "sb3_single_agent", "torchrl_ppo", "shared_parameters"}
+    assert names == {"ppo_torch", "sb3_single_agent", "torchrl_ppo", "shared_parameters", "other_tasks"}
     for name in names:
         text = (FOLDER / f"{name}.py").read_text()
         assert len(text.splitlines()) <= 170 and f"scripts/examples/{name}.py" in text, "it says how it is run"
@@ -75,3 +75,9 @@ def test_torchrl(example, capsys) -> None:
 def test_shared_parameters(example, capsys) -> None:
     example("shared_parameters").main(steps=700, rollout=700, mission="M1")
     assert "mission completed" in capsys.readouterr().out
+
+
+def test_other_tasks(example, capsys) -> None:
+    example("other_tasks").main("avoidance,surveillance", planners="scripted,TAB-POMCP", episodes=1)
+    out = capsys.readouterr().out
+    assert "avoidance: M1 ambiguous" in out and "surveillance: M1 ambiguous" in out and out.count("TAB-POMCP") == 2
