@@ -21,8 +21,8 @@ class FieldOptions:
     """None: the finest of CELL_SIZES_METRES within `state_budget`."""
     headings: int = 16
     """Directions, where the reference has any (in space 6, 14 or 26); halved when even the coarsest cells exceed the budget."""
-    mean_run_metres: float = 0.5
-    """Of run-and-tumble and drive-and-turn. 0.5 predicted held-out adversaries best (docs/studies/field.md)."""
+    mean_run_metres: float = 1.0
+    """Of run-and-tumble and drive-and-turn. 0.5 predicts slightly better, 1 intercepts sooner (docs/studies/field.md)."""
     rest_seconds: float = 10.0
     """How long a rest lasts on average, in drive-and-turn."""
     goal_marginals: bool = True
