@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 
 
 class UserError(Exception):
@@ -12,6 +13,15 @@ class UserError(Exception):
 
 class Interrupted(Exception):
     """The run was asked to stop; what was finished is stored."""
+
+
+@contextmanager
+def user_input() -> Iterator[None]:
+    """Inside, a ValueError speaks of what the user gave."""
+    try:
+        yield
+    except ValueError as error:
+        raise UserError(" ".join(str(error).split())) from error
 
 
 def require_known(kind: str, names: Sequence[str], known: Iterable[str]) -> tuple[str, ...]:

@@ -5,15 +5,14 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tab_marl.evaluation.errors import UserError
+from tab_marl.evaluation.errors import UserError, user_input
 from tab_marl.mission import InfeasibleMission, Mission, check_feasible, parse_mission, to_english
 from tab_marl.world.grid import GridMap
 from tab_marl.world.regions import Disc
@@ -47,15 +46,6 @@ class FieldRequest:
     """`scenario`, `nearer` (moved only if the mission is impossible from there) or "x,y" in metres."""
 
 
-@contextmanager
-def _input() -> Iterator[None]:
-    """Inside, a ValueError speaks of what the user gave."""
-    try:
-        yield
-    except ValueError as error:
-        raise UserError(" ".join(str(error).split())) from error
-
-
 def show_field(asked: FieldRequest) -> str:
     """Solve, write what was asked for, and say in words what the field says. Raises UserError."""
     from tab_marl.field import FieldOptions, FieldProblem, solve
@@ -63,7 +53,7 @@ def show_field(asked: FieldRequest) -> str:
 
     for path, kinds in ((asked.picture, PICTURES), (asked.answers, ANSWERS), (asked.save, (".npz",))):
         _check_target(path, kinds)
-    with _input():
+    with user_input():
         if asked.animation is not None:
             check_film(asked.animation)
             _check_target(asked.animation, (asked.animation.suffix.casefold(),))
@@ -81,7 +71,7 @@ def show_field(asked: FieldRequest) -> str:
         field.plot(asked.picture)
         lines.append(f"picture      {asked.picture}")
         if asked.animation is not None:
-            with _input():
+            with user_input():
                 count = field.animate(asked.animation)
             lines.append(f"animation    {asked.animation} ({count} frames)")
         if asked.save is not None:

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from tab_marl.evaluation.field_study import LEVEL
+from tab_marl.evaluation.statistics import share
 
 CEILING = "knows the population"
 SHOWN = {
@@ -91,20 +92,14 @@ def pursuit_table(episodes: pd.DataFrame) -> str:
     played = episodes[episodes.error.isna() | (episodes.error == "")]
     lines = []
     for (field, mission, family), part in played.groupby(["field", "mission", "family"], sort=False):
-        low, high = _bootstrap(part.completed.to_numpy(dtype=float))
+        missed = share(part.completed)
         lines.append(
             [
-                str(field), str(mission), str(family), str(len(part)), f"{100 * part.completed.mean():.1f} [{100 * low:.0f}, {100 * high:.0f}]",
+                str(field), str(mission), str(family), str(len(part)), f"{100 * missed.value:.1f} [{100 * missed.low:.0f}, {100 * missed.high:.0f}]",
                 f"{part.physics_steps.mean():.0f}", f"{part.milliseconds.mean():.0f}",
             ]
         )  # fmt: skip
     return markdown(["field", "mission", "family", "episodes", "ATCR %", "StI", "ms a decision"], lines)
-
-
-def _bootstrap(values: np.ndarray) -> tuple[float, float]:
-    drawn = np.random.default_rng(0).integers(len(values), size=(RESAMPLES, len(values)))
-    low, high = np.quantile(values[drawn].mean(axis=1), [0.025, 0.975])
-    return float(low), float(high)
 
 
 def _figure(scored: pd.DataFrame, path: Path) -> None:

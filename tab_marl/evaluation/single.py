@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,19 +12,10 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from tab_marl.evaluation.errors import UserError, require_known
+from tab_marl.evaluation.errors import UserError, require_known, user_input
 
 FILM_STRIDE = 2
 """Every second control step becomes a frame."""
-
-
-@contextmanager
-def _input() -> Iterator[None]:
-    """Inside, a ValueError speaks of what the user gave."""
-    try:
-        yield
-    except ValueError as error:
-        raise UserError(" ".join(str(error).split())) from error
 
 
 def watch_episode(
@@ -47,7 +37,7 @@ def watch_episode(
     else:
         film.check_target(out)
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
-    with _input():
+    with user_input():
         task = task_source(None, mission, scenario, family)(np.random.default_rng(seed))
     agent = make_planner(planner)
     frames: list[film.Frame] = []
@@ -85,7 +75,7 @@ def train_policy(
 
     if style is not None and config is not None:
         raise UserError("give --style or --config, not both: the file holds a style")
-    with _input():
+    with user_input():
         base = (
             TrainingSettings.from_toml(config) if config is not None else TrainingSettings.for_style(style or "direct")
         )

@@ -96,11 +96,7 @@ class MissionAutomaton:
 
     def masks(self, points: ArrayLike) -> NDArray[np.int32]:
         """``[N]`` labels of points ``[N, 2]`` in metres."""
-        p = np.atleast_2d(np.asarray(points, dtype=np.float64))
-        found = np.zeros(len(p), dtype=np.int32)
-        for bit, region in enumerate(self.regions):
-            found |= region.contains(p).astype(np.int32) << bit
-        return found
+        return masks_of(self.regions, points)
 
     def first(self, mask: int) -> AutomatonState:
         """The state at tick 0, whose label is `mask`."""
@@ -132,3 +128,12 @@ class MissionAutomaton:
 
 def _three(clocks: tuple[int, ...]) -> tuple[int, int, int]:
     return (clocks[0], clocks[1], clocks[2])
+
+
+def masks_of(regions: tuple[Region, ...], points: ArrayLike) -> NDArray[np.int32]:
+    """``[N]``: bit p is set where a point ``[N, D]`` (metres) lies in ``regions[p]``."""
+    p = np.atleast_2d(np.asarray(points, dtype=np.float64))
+    found = np.zeros(len(p), dtype=np.int32)
+    for bit, region in enumerate(regions):
+        found |= region.contains(p).astype(np.int32) << bit
+    return found

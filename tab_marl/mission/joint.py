@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tab_marl.mission import kernels
-from tab_marl.mission.automaton import NO_BRANCH, MissionAutomaton
+from tab_marl.mission.automaton import NO_BRANCH, MissionAutomaton, masks_of
 from tab_marl.mission.compile import compile_mission
 from tab_marl.mission.model import Mission
 from tab_marl.mission.places import MissionWorld
@@ -36,11 +36,7 @@ class JointAutomaton:
 
     def masks(self, points: ArrayLike) -> NDArray[np.int32]:
         """``[N]`` labels of points ``[N, D]`` in metres."""
-        p = np.atleast_2d(np.asarray(points, dtype=np.float64))
-        found = np.zeros(len(p), dtype=np.int32)
-        for bit, region in enumerate(self.regions):
-            found |= region.contains(p).astype(np.int32) << bit
-        return found
+        return masks_of(self.regions, points)
 
     def masks_of_part(self, part: int, masks: ArrayLike) -> NDArray[np.int32]:
         """``[N]``: the joint masks as that mission sees them."""
