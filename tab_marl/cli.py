@@ -85,7 +85,7 @@ def evaluate(
     experiment = prepare(settings)
     with Store.create(out) as store:
         play_missing(experiment, store, play_job, notes, f"tab-marl {shlex.join(sys.argv[1:])}")
-        from tab_marl.evaluation.present import present
+        from tab_marl.evaluation.report.present import present
 
         present(store, store.settings()[0], out, settings.replays, notes)
 
@@ -98,7 +98,7 @@ def report(
 ) -> None:
     """Print the tables of stored episodes again and rewrite their report."""
     from tab_marl.evaluation.console import notes_console
-    from tab_marl.evaluation.present import present
+    from tab_marl.evaluation.report.present import present
     from tab_marl.evaluation.store import Store
 
     notes = notes_console()

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from tab_marl.evaluation import tables
-from tab_marl.evaluation.paper import PAPER
+from tab_marl.evaluation.report.paper import PAPER
 from tab_marl.evaluation.rows import EpisodeRow
 from tab_marl.evaluation.settings import HEADLINE
 from tab_marl.evaluation.statistics import Interval, Paired, stars

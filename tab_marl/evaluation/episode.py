@@ -19,7 +19,7 @@ from tab_marl.agents.planners import EgoAgent, PlannerOptions, make_planner
 from tab_marl.agents.zoo import find_policy, load_policy, load_zoo
 from tab_marl.envs.intercept_v0 import parallel_env
 from tab_marl.evaluation.errors import Interrupted, UserError, require_known
-from tab_marl.evaluation.replay import Trace, shrink
+from tab_marl.evaluation.report.replay import Trace, shrink
 from tab_marl.evaluation.rows import EpisodeRow, Timing
 from tab_marl.evaluation.runner import stop_requested
 from tab_marl.evaluation.units import Job, unit_seeds

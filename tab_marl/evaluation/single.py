@@ -26,7 +26,7 @@ def watch_episode(
     from tab_marl.envs.task_source import task_source
     from tab_marl.evaluation import film
     from tab_marl.evaluation.episode import opponent, resolve_opponents, run_episode
-    from tab_marl.evaluation.replaying import outcome
+    from tab_marl.evaluation.report.replaying import outcome
     from tab_marl.mission import to_english
 
     (planner,) = require_known("planner", (planner,), PLANNERS)

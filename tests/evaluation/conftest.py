@@ -3,8 +3,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tab_marl.evaluation import replay, settings
-from tab_marl.evaluation.report import ReportData
+from tab_marl.evaluation import settings
+from tab_marl.evaluation.report import replay
+from tab_marl.evaluation.report.page import ReportData
 from tab_marl.evaluation.units import Job, Unit
 from tab_marl.world.scenario import Scenario
 

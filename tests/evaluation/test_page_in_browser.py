@@ -6,7 +6,7 @@ import subprocess
 
 import pytest
 
-from tab_marl.evaluation import report
+from tab_marl.evaluation.report import page as report
 
 BROWSER = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from tab_marl.evaluation import replay
+from tab_marl.evaluation.report import replay
 from tab_marl.evaluation.units import Unit
 from tab_marl.world.scenario import Scenario
 

@@ -9,9 +9,11 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from tab_marl.evaluation import charts, figures, report, settings
+from tab_marl.evaluation import settings
 from tab_marl.evaluation.errors import UserError
-from tab_marl.evaluation.report import ReportData
+from tab_marl.evaluation.report import charts, explanation
+from tab_marl.evaluation.report import page as report
+from tab_marl.evaluation.report.page import ReportData
 from tab_marl.evaluation.statistics import Interval
 
 VOID = {"meta", "link", "input", "br", "img"}
@@ -179,8 +181,8 @@ def test_text_has_contrast_in_light_and_dark():
 
 
 def test_explanation_draws_the_field():
-    drawn = figures.explanation()
-    assert drawn["field"].count("<figure>") == len(figures.MOMENTS) == drawn["walk"].count("<figure>")
+    drawn = explanation.explanation()
+    assert drawn["field"].count("<figure>") == len(explanation.MOMENTS) == drawn["walk"].count("<figure>")
     done = [int(n) for n in re.findall(r"(\d+) % done", drawn["field"])]
     assert done == sorted(done) and done[-1] > 50
     assert drawn["field"] != drawn["walk"]

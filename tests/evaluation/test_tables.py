@@ -7,8 +7,8 @@ import pytest
 from rich.console import Console
 
 from tab_marl.evaluation import console, tables
-from tab_marl.evaluation.findings import findings
-from tab_marl.evaluation.paper import PAPER
+from tab_marl.evaluation.report.findings import findings
+from tab_marl.evaluation.report.paper import PAPER
 from tab_marl.evaluation.rows import Timing
 
 

@@ -16,8 +16,8 @@ from tab_marl.evaluation import console as text
 from tab_marl.evaluation import tables
 from tab_marl.evaluation.errors import UserError
 from tab_marl.evaluation.evaluate import REPORT_NAME
-from tab_marl.evaluation.replay import choose
-from tab_marl.evaluation.report import ReportData, write_report
+from tab_marl.evaluation.report.page import ReportData, write_report
+from tab_marl.evaluation.report.replay import choose
 from tab_marl.evaluation.rows import EpisodeRow
 from tab_marl.evaluation.settings import FAMILIES, MISSIONS, PLANNERS
 from tab_marl.evaluation.store import Store, StoredSettings
@@ -37,8 +37,8 @@ def present(store: Store, stored: StoredSettings, folder: Path, replays: int | N
     if choices:
         notes.print(f"playing {len(choices)} episodes again for the report", highlight=False)
     from tab_marl.evaluation.episode import opponent
-    from tab_marl.evaluation.figures import explanation
-    from tab_marl.evaluation.replaying import replay_groups
+    from tab_marl.evaluation.report.explanation import explanation
+    from tab_marl.evaluation.report.replaying import replay_groups
     from tab_marl.evaluation.zoo_view import describe
 
     workers = stored.requested.get("workers") or os.cpu_count() or 1

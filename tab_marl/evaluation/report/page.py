@@ -13,10 +13,11 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
-from tab_marl.evaluation import charts, statistics, tables
+from tab_marl.evaluation import statistics, tables
 from tab_marl.evaluation.errors import UserError
-from tab_marl.evaluation.findings import findings
-from tab_marl.evaluation.paper import MISSION_TEXT, PAPER, TAB_TIME_RATIO
+from tab_marl.evaluation.report import charts
+from tab_marl.evaluation.report.findings import findings
+from tab_marl.evaluation.report.paper import MISSION_TEXT, PAPER, TAB_TIME_RATIO
 from tab_marl.evaluation.rows import EpisodeRow, Timing, scored_completed
 from tab_marl.evaluation.settings import HEADLINE, PLANNERS
 from tab_marl.evaluation.statistics import Interval, Paired
@@ -130,7 +131,7 @@ def json_for_script(value: object) -> str:
 
 
 def _template(name: str) -> str:
-    return resources.files("tab_marl.evaluation").joinpath("templates", name).read_text(encoding="utf-8")
+    return resources.files("tab_marl.evaluation.report").joinpath("templates", name).read_text(encoding="utf-8")
 
 
 def _panels(found: Sequence[Line], family: str) -> list[dict[str, Any]]:

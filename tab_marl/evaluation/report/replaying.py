@@ -10,7 +10,7 @@ import numpy as np
 
 from tab_marl.envs.mission_scene import mission_scene
 from tab_marl.evaluation.episode import Played, play_unit
-from tab_marl.evaluation.replay import Choice, encode_map, encode_trace
+from tab_marl.evaluation.report.replay import Choice, encode_map, encode_trace
 from tab_marl.evaluation.rows import EpisodeRow
 from tab_marl.evaluation.runner import pool
 from tab_marl.evaluation.settings import LEARNS_ACROSS_EPISODES

@@ -9,7 +9,7 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.evaluation.replay import encode_region
+from tab_marl.evaluation.report.replay import encode_region
 from tab_marl.world.regions import Region
 from tab_marl.world.scenario import Scenario
 
