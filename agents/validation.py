@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tab_marl.agents.adversaries import AdversaryPolicy
+from tab_marl.agents.cards import MissionRecord
 from tab_marl.agents.rollouts import Rollouts, run_bank
 from tab_marl.agents.training_env import HELD_OUT, build_bank, draw_tasks
-from tab_marl.agents.zoo import MissionRecord
 from tab_marl.envs.adversary_kernels import VIA_METRES
 from tab_marl.envs.adversary_observation import AdversaryTask
 from tab_marl.envs.batched import Bank

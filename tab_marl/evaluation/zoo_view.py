@@ -64,7 +64,7 @@ def zoo_card(name: str) -> str:
         f"policy      {card.name}",
         f"what it is  {card.description or _style_text(card.style)}",
         f"trained by  {card.algorithm}, {card.steps} steps: {card.command}",
-        f"network     {' - '.join(str(width) for width in card.layers)}, observation layout {card.layout_version}",
+        f"network     {' - '.join(str(width) for width in card.network.layers)}, observation layout {card.layout_version}",
         f"weights     sha256 {card.sha256}",
     ]
     for record in card.success:
