@@ -25,6 +25,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tab_marl.agents.planner_memory import PlannerMemory
 from tab_marl.envs.ego_observation import EgoView, parse_ego_observation
 from tab_marl.field.problem import FieldOptions
 from tab_marl.mission.propositions import region_of
@@ -68,6 +69,8 @@ class PlannerOptions:
     """Of S-POMCP and MLE-POMCP."""
     rollouts: Rollouts | None = None
     """Of population-POMCP; None: the zoo that ships with the package."""
+    memory: PlannerMemory | None = None
+    """Keeps what depends on the task alone, where the same tasks come again and again."""
 
     def __post_init__(self) -> None:
         if self.particles < 1:
@@ -132,7 +135,10 @@ class PlannerAgent:
     def reset(self, task: Task, rng: np.random.Generator) -> None:
         scenario = task.scenario
         self.task, self.rng = task, rng
-        self.routes = RouteMap.build(scenario, goal_places(task), self.options.routes)
+        memory = self.options.memory
+        self.routes = (RouteMap.build if memory is None else memory.routes)(
+            scenario, goal_places(task), self.options.routes
+        )
         model = self._make_model(task, rng)
         prior = dict(self.options.guards).get(self.name, 0.0)
         guarded = prior > 0
@@ -196,7 +202,9 @@ class PlannerAgent:
             pool = TrajectoryPool(scenario, positions, completed, options.pool)
             pool.wander_after_completion(MissionMap.build(scenario, mission), rng)
             return pool
-        return FieldModel(scenario, mission, options.tab_field)
+        memory = options.memory
+        solved = None if memory is None else memory.field(scenario, mission, options.tab_field)
+        return FieldModel(scenario, mission, options.tab_field, solved)
 
     def _update(self, view: EgoView) -> None:
         """Hand the model what happened since the last tick."""

@@ -7,6 +7,8 @@ mission leaves time for it (`SLACK_NEEDED`), in full, in half, in a quarter, or 
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -28,6 +30,8 @@ ZONE_MARGIN_COST = 3.0
 WALL_SIDE_COST = 1.15
 NOISE_METRES = 0.5
 """Distance between the independent values of the random cost field."""
+WEIGHT_SLIP = 1e-3
+"""By which the weights of a mixture may miss 1 (they are written down rounded)."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,8 @@ class Style:
     """Each place that could be visited costs up to this many metres more, drawn per episode: soft order, soft choice."""
     arrival_fraction: tuple[float, float] | None = None
     """Range of the share of the allowed time at which to arrive; None: as soon as possible."""
+    mixture: tuple[Habit, ...] = ()
+    """If any, an episode's latents are those of one of these habits, drawn by their weights; the fields above are unused."""
 
     __pydantic_config__: ClassVar = STRICT
 
@@ -67,6 +73,14 @@ class Style:
             object.__setattr__(self, "arrival_fraction", (float(low), float(high)))
             if not 0 < low <= high < 1:
                 raise ValueError(f"Style.arrival_fraction is {self.arrival_fraction}, must be 0 < low <= high < 1")
+        object.__setattr__(self, "mixture", tuple(self.mixture))
+        if self.mixture:
+            for name in ("weight", "open_weight"):
+                total = sum(getattr(habit, name) for habit in self.mixture)
+                if not math.isclose(total, 1.0, abs_tol=WEIGHT_SLIP):
+                    raise ValueError(f"Style.mixture: the {name}s sum to {total:.6g}, must sum to 1")
+            if any(habit.style.mixture for habit in self.mixture):
+                raise ValueError("Style.mixture: a habit's style has a mixture of its own, must be a plain style")
 
     @classmethod
     def preset(cls, name: str) -> Style:
@@ -80,8 +94,18 @@ class Style:
         """Whether two draws can differ."""
         return self != Style(name=self.name)
 
-    def draw(self, rng: np.random.Generator) -> Latents:
-        """Latents of one episode. Every draw takes the same numbers from `rng`, whatever is switched on."""
+    def weights(self, open_ended: bool) -> NDArray[np.float64]:
+        """``[H]`` probabilities of the mixture's habits, for missions whose last goal is any of several places or not."""
+        return np.array([habit.open_weight if open_ended else habit.weight for habit in self.mixture])
+
+    def draw(self, rng: np.random.Generator, open_ended: bool = False) -> Latents:
+        """Latents of one episode. Every draw takes the same numbers from `rng`, whatever is switched on.
+
+        `open_ended`: whether the mission's last goal is any of several places.
+        """
+        if self.mixture:
+            chosen = np.searchsorted(np.cumsum(self.weights(open_ended)), rng.random(), side="right")
+            return self.mixture[min(int(chosen), len(self.mixture) - 1)].style.draw(rng)
         side_on, sign, via_on = rng.random(), rng.random(), rng.random()
         via_share, fraction = rng.random(), rng.random()
         seed = int(rng.integers(2**31))
@@ -96,6 +120,24 @@ class Style:
             arrival_fraction=low + fraction * (high - low),
             seed=seed,
         )
+
+
+@dataclass(frozen=True)
+class Habit:
+    """One way of behaving, and how likely an episode begins with it."""
+
+    style: Style
+    weight: float
+    """Probability in missions whose last goal is one place."""
+    open_weight: float
+    """Probability in missions whose last goal is any of several."""
+
+    __pydantic_config__: ClassVar = STRICT
+
+    def __post_init__(self) -> None:
+        for name in ("weight", "open_weight"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"Habit.{name} is {getattr(self, name)}, must be a probability in 0..1")
 
 
 @dataclass(frozen=True)
@@ -131,6 +173,25 @@ STYLES: dict[str, Style] = {
         Style("fickle", order_metres=6.0),
     )
 }
+
+
+def mixture_of(name: str, styles: Sequence[Style]) -> Style:
+    """The style that draws one of these per episode, all equally likely."""
+    share = 1.0 / len(styles)
+    return Style(name, mixture=tuple(Habit(style, share, share) for style in styles))
+
+
+STYLES["habits"] = mixture_of(
+    "habits",
+    (
+        *(STYLES[name] for name in ("direct", "side", "via", "camera-shy", "late", "wander", "fickle")),
+        Style("fickle-via", via=1.0, order_metres=6.0),
+        Style("fickle-late", arrival_fraction=(0.75, 0.9), order_metres=6.0),
+        Style("fickle-shy", camera_shy=6.0, order_metres=6.0),
+        Style("fickle-side", side=1.0, order_metres=6.0),
+        Style("shy-late", camera_shy=6.0, arrival_fraction=(0.75, 0.9), order_metres=6.0),
+    ),
+)
 
 
 def clearance_cost(grid: GridMap, zone_distance: NDArray[np.float64]) -> NDArray[np.float64]:

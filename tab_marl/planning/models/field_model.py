@@ -44,10 +44,19 @@ def camera_cover(scenario: Scenario, grid: GridMap) -> NDArray[np.float64]:
 class FieldModel:
     """The exact belief over cells x modes x mission states under the field's own kernel."""
 
-    def __init__(self, scenario: Scenario, mission: Mission, options: FieldOptions | None = None) -> None:
-        """Raises InfeasibleField when the reference process cannot complete the mission."""
+    def __init__(
+        self,
+        scenario: Scenario,
+        mission: Mission,
+        options: FieldOptions | None = None,
+        field: TabField | None = None,
+    ) -> None:
+        """`field`: the task's, if it is solved already.
+
+        Raises InfeasibleField when the reference process cannot complete the mission.
+        """
         self.scenario = scenario
-        self.field = solved_field(scenario, mission, options or FieldOptions())
+        self.field = field or solved_field(scenario, mission, options or FieldOptions())
         grid = self.field.problem.grid
         assert isinstance(grid, GridMap)  # a field made from a planar mission has one
         self.grid = grid

@@ -1,0 +1,217 @@
+"""The hunted world: batched arenas in which a live ego hunts the adversary that learns, as a vector environment for
+stable-baselines3. Being caught ends the episode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+
+from tab_marl.agents.hunted_egos import SEEDS, Hunters, hunter_names
+from tab_marl.agents.planners import PlannerOptions
+from tab_marl.agents.training_env import WINDOW
+from tab_marl.envs.adversary_observation import AdversaryTask, observation_bounds
+from tab_marl.envs.batched_arenas import EVENTS, BatchedArenas
+from tab_marl.envs.episode import draw_starts
+from tab_marl.envs.reward import SHAPED, AdversaryRewards
+from tab_marl.envs.styles import Style
+from tab_marl.mission.tasks import Task
+
+REWARDS = replace(SHAPED, per_step=0.0)
+"""Those of the batched training world, but waiting is free: a hunted adversary may need to."""
+VISIT_REWARD = 1.0
+INTERCEPTED, COMPLETED, FAILED = (EVENTS.index(name) for name in ("intercepted", "completed", "failed"))
+
+
+def hunted_tasks(tasks: Sequence[Task], style: Style, seed: int, draws: int, seen_metres: float) -> list[AdversaryTask]:
+    """`draws` draws of the style's habits for each task, one after the other; latents depend on (seed, index) only.
+
+    `seen_metres`: the range in which the adversary sees the ego, with a free line of sight; 0: never.
+    """
+    found: list[AdversaryTask] = []
+    for i, task in enumerate(tasks):
+        aware = replace(
+            task.scenario, sensors=replace(task.scenario.sensors, adversary_sees_ego_metres=float(seen_metres))
+        )
+        found += AdversaryTask.draw(aware, task.mission, style, np.random.default_rng((seed, i)), draws)
+    return found
+
+
+class HuntedVecEnv(VecEnv):
+    """N arenas; an ego drawn from `opponent` ("pursue", "FP-POMCP+TAB-POMCP", an SB3 ego's .zip) hunts in each.
+
+    An arena whose episode ends begins one on another task of the bank, drawn by `weights` ``[K]`` (summing to 1), from
+    starts drawn as `InterceptEnv` draws them. The reward: `REWARDS` and `VISIT_REWARD` per counted visit; a mission that
+    the episode's end leaves open has failed.
+    """
+
+    render_mode = None
+
+    def __init__(
+        self,
+        tasks: Sequence[AdversaryTask],
+        kinds: Sequence[str],
+        arenas: int,
+        seed: int,
+        opponent: str = "pursue",
+        options: PlannerOptions | None = None,
+        rewards: AdversaryRewards = REWARDS,
+    ) -> None:
+        """`tasks`: see `hunted_tasks`; `kinds`: the mission type of each; `options`: the planners'. Raises UnknownName for
+        an ego that nobody knows."""
+        low, high = observation_bounds()
+        super().__init__(arenas, Box(low, high, dtype=np.float32), Box(-1.0, 1.0, (2,), np.float32))
+        if len(kinds) != len(tasks):
+            raise ValueError(f"there are {len(kinds)} kinds for {len(tasks)} tasks: give each task's mission type")
+        self.rng = np.random.default_rng((seed, 11))
+        self.kinds = tuple(kinds)
+        """Mission type of each task."""
+        self.weights = np.full(len(tasks), 1.0 / len(tasks))
+        self.recent: dict[str, list[float]] = {kind: [] for kind in sorted(set(kinds))}
+        self.recently_caught: list[float] = []
+        self.observation = np.zeros((arenas, len(low)), dtype=np.float32)
+        """``[N, 40]`` what the adversaries observe now."""
+        self.hunters = Hunters(hunter_names(opponent), arenas, options)
+        self.arenas = BatchedArenas(tasks, arenas, end_on_completion=True, adversary_rewards=rewards)
+        self._failed_price = rewards.failed
+        self._tasks = [Task(task.scenario, task.mission, "", "custom", 0.0) for task in tasks]
+        longest = max(round(task.scenario.horizon_seconds * task.scenario.control_hertz) for task in tasks)
+        self._action = np.zeros((arenas, 2), dtype=np.float32)
+        self._ego = np.zeros((arenas, self.arenas.observed_by_ego), dtype=np.float32)
+        self._returns = np.zeros(arenas)
+        self._visits = np.zeros(arenas, dtype=np.int64)
+        # What an episode under way began with and was told since: enough to play it again.
+        self._hunter = np.zeros(arenas, dtype=np.int64)
+        self._seed = np.zeros(arenas, dtype=np.int64)
+        self._start = np.zeros((arenas, 2, 3))
+        self._told = np.zeros((arenas, longest + 1, 2), dtype=np.float32)
+        self._learned = [""] * arenas
+
+    def _begin(self, which: NDArray[np.int64]) -> None:
+        chosen = self.rng.choice(len(self.weights), size=len(which), p=self.weights)
+        for i, k in zip(which, chosen, strict=True):
+            self._start[i] = draw_starts(self._tasks[k].scenario, self.rng)
+            self._hunter[i] = self.rng.integers(len(self.hunters.names))
+            self._seed[i] = self.rng.integers(SEEDS)
+            self._learned[i] = self.hunters.begin(i, self._hunter[i], self._tasks[k], int(self._seed[i]))
+        self._place(which, chosen)
+
+    def _place(self, which: NDArray[np.int64], tasks: NDArray[np.int64]) -> None:
+        self._ego, self.observation = self.arenas.begin(which, self.rng, tasks, self._start[which])
+        self._visits[which] = self.arenas.visits[which]
+        self._returns[which] = 0.0
+
+    def reset(self) -> NDArray[np.float32]:
+        self._begin(np.arange(self.num_envs))
+        return self.observation.copy()
+
+    def step_async(self, actions: NDArray[np.float32]) -> None:
+        self._action = np.asarray(actions, dtype=np.float32)
+
+    def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+        arenas = self.arenas
+        rows = np.arange(self.num_envs)
+        self._told[rows, arenas.steps] = self._action
+        reward, done, events = self._play(self._action)
+        infos: list[dict[str, Any]] = [{} for _ in rows]
+        ended = np.flatnonzero(done)
+        for i in ended:
+            completed, caught = bool(events[i, COMPLETED]), bool(events[i, INTERCEPTED])
+            infos[i] = {
+                "terminal_observation": self.observation[i].copy(),
+                "episode": {"r": float(self._returns[i]), "l": int(arenas.steps[i]), "t": 0.0},
+                "task": int(arenas.task[i]),
+                "hunter": self.hunters.names[self._hunter[i]],
+                "completed": completed,
+                "intercepted": caught,
+            }
+            recent = self.recent[self.kinds[arenas.task[i]]]
+            recent.append(float(completed))
+            self.recently_caught.append(float(caught))
+            del recent[:-WINDOW], self.recently_caught[:-WINDOW]
+        if len(ended):
+            self._begin(ended)
+        return self.observation.copy(), reward.astype(np.float32), done, infos
+
+    def _play(self, actions: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
+        """One control step of all arenas: rewards, ends, events."""
+        outcome = self.arenas.step(self.hunters.act(self._ego), actions)
+        self._ego, self.observation = outcome.ego, outcome.adversary
+        visits = self.arenas.visits
+        reward = outcome.rewards[:, 1] + VISIT_REWARD * (visits - self._visits)
+        reward += np.where(outcome.truncated & (self.arenas.location >= 0), self._failed_price, 0.0)
+        self._visits = visits
+        self._returns += reward
+        return reward, outcome.terminated | outcome.truncated, outcome.events
+
+    def success(self) -> dict[str, float]:
+        """Share of completed missions per mission type over the last episodes (nan before the first)."""
+        return {kind: float(np.mean(recent)) if recent else float("nan") for kind, recent in self.recent.items()}
+
+    def snapshot(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+        """Everything that what follows depends on: arrays, and JSON values. Call it between steps."""
+        arrays = {
+            "task": self.arenas.task.copy(),
+            "steps": self.arenas.steps,
+            "hunter": self._hunter.copy(),
+            "seed": self._seed.copy(),
+            "start": self._start.copy(),
+            "told": self._told[:, : int(self.arenas.steps.max()) + 1].copy(),
+            "weights": self.weights.copy(),
+        }
+        text = {
+            "random": self.rng.bit_generator.state,
+            "recent": self.recent,
+            "caught": self.recently_caught,
+            "learned": self._learned,
+        }
+        return arrays, text
+
+    def restore(self, arrays: dict[str, NDArray[Any]], text: dict[str, Any]) -> None:
+        """Back to a `snapshot`. A planner's mind is not kept: the episodes under way are played again, up to where they
+        stood, from the same seeds and with the same actions."""
+        steps, task = arrays["steps"], arrays["task"]
+        self._hunter[:], self._seed[:], self._start[:] = arrays["hunter"], arrays["seed"], arrays["start"]
+        self._told[:, : arrays["told"].shape[1]] = arrays["told"]
+        self._learned = list(text["learned"])
+        last = int(steps.max())
+        self.hunters.stop()
+        for now in range(last + 1):
+            # Each arena begins so late that all stand where they stood after the last round.
+            which = np.flatnonzero(last - steps == now)
+            for i in which:
+                self.hunters.begin(
+                    i, self._hunter[i], self._tasks[task[i]], int(self._seed[i]), self._learned[i]
+                )  # fmt: skip
+            if len(which):
+                self._place(which, task[which])
+            if now < last:
+                begun = np.flatnonzero(last - steps <= now)
+                actions = np.tile(np.array([-1.0, 0.0], dtype=np.float32), (self.num_envs, 1))
+                actions[begun] = self._told[begun, now - (last - steps[begun])]
+                self._play(actions)
+        self.weights = arrays["weights"].copy()
+        self.recent, self.recently_caught = text["recent"], text["caught"]
+        self.rng.bit_generator.state = text["random"]
+
+    # What VecEnv asks for beside that; the arenas have no attributes of their own.
+    def close(self) -> None:
+        pass
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        setattr(self, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        raise AttributeError(f"the hunted world has no method {method_name!r} per arena")
+
+    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+        return [False] * len(list(self._get_indices(indices)))
