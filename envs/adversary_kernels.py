@@ -282,6 +282,22 @@ def observe(bank, k, x, y, theta, v, w, location, clocks, memory, ego_seen, ego_
 
 
 @njit(cache=True)
+def gained(before, after, via, dropped, memory, owed_length, owed_excess, length, excess):
+    """What a step brought in metres: (drop of the distance-to-go, drop of the excess time x pace).
+
+    `before`, `after`: locations; `via`, `dropped`: `memory` before the step; `owed_*` and the last two: what `observe`
+    returned before and after it. Nothing is gained or lost where the route itself changed, or by a failure.
+    """
+    if before < 0 or after == -2:
+        return 0.0, 0.0
+    if after == -1:
+        return owed_length, 0.0
+    same_route = memory[1] == dropped
+    metres = owed_length - length if same_route and memory[0] == via else 0.0
+    return metres, owed_excess - excess if same_route and after == before else 0.0
+
+
+@njit(cache=True)
 def _observe_zone(bank, k, location, x, y, cos, sin, out):
     """Direction (body frame) and metres, at most 1, to the nearest region that fails the mission at this location."""
     number = bank.number[k]

@@ -38,8 +38,9 @@ from numpy.typing import NDArray
 
 from tab_marl.envs import adversary_kernels as kernels
 from tab_marl.envs.adversary_tables import LATENT_MAX, Parts, Tables, later_windows, pack, zones
+from tab_marl.envs.reward import Gained
 from tab_marl.envs.styles import SLACK_NEEDED, STRENGTHS, Latents, Style, clearance_cost, styled_cost
-from tab_marl.mission.automaton import COMPLETED, UNBOUNDED, MissionAutomaton
+from tab_marl.mission.automaton import COMPLETED, FAILED, UNBOUNDED, MissionAutomaton
 from tab_marl.mission.compile import compile_mission
 from tab_marl.mission.model import Mission
 from tab_marl.mission.route import RouteField, solve_route
@@ -59,6 +60,11 @@ VIA_CLEAR_METRES = 0.2
 """Between a via point and a zone that fails the mission."""
 VIA_DETOUR_METRES = (0.4, 3.0)
 """How much longer a way over a via point is."""
+
+
+def leaves_choice(mission: Mission) -> bool:
+    """Whether the mission's last goal is any of several places."""
+    return bool(mission.goals) and len(mission.goals[-1].places) > 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +119,7 @@ class AdversaryTask:
         """`count` tasks that differ in their latents; what they share is computed once."""
         automaton = compile_mission(mission, scenario, 1.0 / scenario.control_hertz)
         plain = _Plain.of(scenario, automaton, GridMap.from_scenario(scenario, cell_metres))
-        parts = [_styled(plain, style.draw(rng)) for _ in range(count)]
+        parts = [_styled(plain, style.draw(rng, leaves_choice(mission))) for _ in range(count)]
         return [cls(scenario, mission, style, part) for part in parts]
 
 
@@ -236,6 +242,9 @@ class AdversaryObserver:
         self._memory = np.zeros(2, dtype=np.int32)
         self._clocks = np.zeros(3, dtype=np.int32)
         self._out = np.zeros(OBSERVED, dtype=np.float32)
+        self._last = (FAILED, 0.0, 0.0)
+        self.gained = Gained()
+        """Between the last two observations."""
         self._look_up()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -259,6 +268,7 @@ class AdversaryObserver:
     def reset(self) -> None:
         """Begin a new episode on the same task."""
         self._memory[:] = 0
+        self._last, self.gained = (FAILED, 0.0, 0.0), Gained()
 
     @property
     def via_passed(self) -> int:
@@ -283,14 +293,22 @@ class AdversaryObserver:
         automaton's location and clocks (in control steps), and the ego's position if the adversary sees it.
         All zero once the mission has ended (location < 0).
         """
+        via, dropped = self._memory.tolist()
+        length = excess = 0.0
         if location < 0:
-            return np.zeros(OBSERVED, dtype=np.float32)
-        self._clocks[:] = clocks
-        ego_x, ego_y = ego or (0.0, 0.0)
-        self._kernel(
-            self.task.tables, 0, x, y, theta, v, w, location, self._clocks, self._memory, ego is not None, ego_x, ego_y,
-            self._out,
-        )  # fmt: skip
+            self._out[:] = 0.0
+        else:
+            self._clocks[:] = clocks
+            ego_x, ego_y = ego or (0.0, 0.0)
+            length, excess = self._kernel(
+                self.task.tables, 0, x, y, theta, v, w, location, self._clocks, self._memory, ego is not None, ego_x,
+                ego_y, self._out,
+            )  # fmt: skip
+        before, owed_length, owed_excess = self._last
+        self.gained = Gained(
+            *kernels.gained(before, location, via, dropped, self._memory, owed_length, owed_excess, length, excess)
+        )
+        self._last = location, length, excess
         return self._out.copy()
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from tab_marl.envs.adversary_observation import AdversaryObserver, AdversaryTask, observation_bounds
 from tab_marl.envs.lidar import Lidar
 from tab_marl.envs.physics import Motion
+from tab_marl.envs.reward import Gained
 from tab_marl.envs.styles import Style
 from tab_marl.mission.monitor import Monitor
 from tab_marl.mission.tasks import Task
@@ -51,8 +52,12 @@ class AdversarySide:
             task.mission, task.scenario, 1.0 / task.scenario.control_hertz, automaton=self.task.automaton
         )
         self._observer = AdversaryObserver(self.task)
+        self.gained = Gained()
+        """Between the last two observations."""
 
     def observe(self, own: Motion, ego: Motion | None) -> NDArray[np.float32]:
         """``[OBSERVED]``; `ego` is None while it is not noticed. Zeros once the mission is over."""
         noticed = None if ego is None else (ego.x, ego.y)
-        return self._observer.observe(*own, self.monitor.location, self.monitor.clocks, noticed)
+        observation = self._observer.observe(*own, self.monitor.location, self.monitor.clocks, noticed)
+        self.gained = self._observer.gained
+        return observation

@@ -24,6 +24,7 @@ from tab_marl.envs.adversary_kernels import (
     RADIUS,
     SUBSTEPS,
     TICK_SECONDS,
+    gained,
     observe,
     region_distance,
     task_advance,
@@ -41,17 +42,17 @@ NUMBERS = 6
 EGO_RADIUS, EGO_SPEED, EGO_TURN, MEETING, SAFE_GAP, WATCH, RAY_METRES, NOTICE = 0, 1, 2, 3, 4, 5, 6, 7
 TICKS_PER_STEP = 8  # ticks of Scenario.step_seconds per control step: what is charged per time step
 P_MEET, P_COLLISION, P_STEP, P_CONTROL, P_COMPLETED, P_ENCOUNTER, P_ARRIVAL, P_WATCHED = 9, 10, 11, 12, 13, 14, 15, 16
-A_COMPLETED, A_FAILED, A_MET, A_COLLISION, A_STEP = 17, 18, 19, 20, 21
-GOAL_X, GOAL_Y = 22, 23
-REALS = 24
+A_COMPLETED, A_FAILED, A_MET, A_COLLISION, A_STEP, A_PROGRESS, A_EXCESS = 17, 18, 19, 20, 21, 22, 23
+GOAL_X, GOAL_Y = 24, 25
+REALS = 26
 # Columns of the events of a step, float64 0 or 1.
 E_INTERCEPTED, E_COMPLETED, E_FAILED, E_EGO_COLLIDED, E_ADVERSARY_COLLIDED, E_ENCOUNTERED, E_ARRIVED, E_WATCHED = (
     0, 1, 2, 3, 4, 5, 6, 7,
 )  # fmt: skip
 EVENTS = 8
 # Columns of the counters of an arena.
-STEPS, DONE_SUBSTEPS, FORGIVEN_EGO, FORGIVEN_ADVERSARY, MISSION = 0, 1, 2, 3, 4
-COUNTERS = 5
+STEPS, DONE_SUBSTEPS, FORGIVEN_EGO, FORGIVEN_ADVERSARY, MISSION, VISITS = 0, 1, 2, 3, 4, 5
+COUNTERS = 6
 ROWS_WITHOUT_LIDAR = 15
 BOUNDARY = 1e-9
 SPEED_TOLERANCE = 0.02
@@ -126,17 +127,19 @@ def _write_robot(robot, top_speed, out, at):
 
 @njit(cache=True)
 def write_adversary(bank, duel, k, robots, location, clocks, memory, out):
-    """The adversary's observation ``out[OBSERVED]``; it notices an ego in range and in sight."""
+    """The adversary's observation ``out[OBSERVED]``; it notices an ego in range and in sight. Returns what `observe` does."""
     reach = duel.real[k, NOTICE]
     x, y, ex, ey = robots[1, 0], robots[1, 1], robots[0, 0], robots[0, 1]
     noticed = reach > 0.0 and math.hypot(ex - x, ey - y) <= reach and sees(bank, k, x, y, ex, ey)
-    observe(
+    return observe(
         bank, k, x, y, robots[1, 2], robots[1, 3], robots[1, 4], location, clocks, memory, noticed, ex, ey, out
     )  # fmt: skip
 
 
 @njit(cache=True)
-def begin_many(bank, duel, which, task, start, full, robots, location, clocks, memory, counter, ego_out, adversary_out):
+def begin_many(
+    bank, duel, which, task, start, full, robots, location, clocks, memory, potential, counter, ego_out, adversary_out
+):  # fmt: skip
     """Begin episodes in the arenas ``which[M]`` from poses ``start[M, 2, 3]`` of ego and adversary."""
     for j in range(which.shape[0]):
         i = which[j]
@@ -152,13 +155,15 @@ def begin_many(bank, duel, which, task, start, full, robots, location, clocks, m
         counter[i, MISSION] = min(location[i], 0)
         watched = watches(bank, duel, k, robots[i])
         write_ego(bank, duel, k, robots[i], counter[i], watched, full, ego_out[i])
-        write_adversary(bank, duel, k, robots[i], location[i], clocks[i], memory[i], adversary_out[i])
+        potential[i, 0], potential[i, 1] = write_adversary(
+            bank, duel, k, robots[i], location[i], clocks[i], memory[i], adversary_out[i]
+        )
 
 
 @njit(cache=True, nogil=True)
 def step_many(
-    bank, duel, task, ego_action, adversary_action, end_on_completion, full, robots, location, clocks, memory, counter,
-    reward, terminated, truncated, event, ego_out, adversary_out,
+    bank, duel, task, ego_action, adversary_action, end_on_completion, full, robots, location, clocks, memory, potential,
+    counter, reward, terminated, truncated, event, ego_out, adversary_out,
 ):  # fmt: skip
     """One control step of every arena; actions ``[N, 2]`` in [-1, 1] (clipped), reward ``[N, 2]`` of ego and adversary."""
     for i in range(task.shape[0]):
@@ -173,7 +178,8 @@ def step_many(
         counter[i, DONE_SUBSTEPS] += done
         counter[i, STEPS] += 1
         event[i, :] = 0.0
-        active = location[i] >= 0
+        before, via, dropped = location[i], memory[i, 0], memory[i, 1]
+        active = before >= 0
         kind = number[EGO_TASK]
         ended = False
         if kind == INTERCEPTION and met:
@@ -193,9 +199,15 @@ def step_many(
         terminated[i] = ended
         truncated[i] = not ended and counter[i, STEPS] >= number[LAST_STEP]
         reward[i, 0] = _ego_reward(real, kind, event[i], robots[i, 0], tick)
-        reward[i, 1] = _adversary_reward(real, event[i], active)
         write_ego(bank, duel, k, robots[i], counter[i], watched, full, ego_out[i])
-        write_adversary(bank, duel, k, robots[i], location[i], clocks[i], memory[i], adversary_out[i])
+        length, excess = write_adversary(
+            bank, duel, k, robots[i], location[i], clocks[i], memory[i], adversary_out[i]
+        )  # fmt: skip
+        metres, waited = gained(
+            before, location[i], via, dropped, memory[i], potential[i, 0], potential[i, 1], length, excess
+        )  # fmt: skip
+        potential[i, 0], potential[i, 1] = length, excess
+        reward[i, 1] = _adversary_reward(real, event[i], active, metres, waited)
 
 
 @njit(cache=True)
@@ -256,7 +268,8 @@ def _advance_mission(bank, k, i, robots, location, clocks, counter, event):
     if robots[i, 1, 3] > limit * (1.0 + SPEED_TOLERANCE):
         location[i] = FAILED
     else:
-        location[i], _ = task_advance(bank, k, location[i], clocks[i], robots[i, 1, 0], robots[i, 1, 1])
+        location[i], counted = task_advance(bank, k, location[i], clocks[i], robots[i, 1, 0], robots[i, 1, 1])
+        counter[i, VISITS] += counted
     if location[i] < 0:
         counter[i, MISSION] = location[i]
         event[i, E_COMPLETED if location[i] == COMPLETED else E_FAILED] = 1.0
@@ -288,9 +301,9 @@ def _ego_reward(real, kind, event, ego, seconds):
 
 
 @njit(cache=True)
-def _adversary_reward(real, event, active):
+def _adversary_reward(real, event, active, metres, waited):
     """`reward.adversary_reward`."""
-    reward = real[A_COLLISION] * event[E_ADVERSARY_COLLIDED]
+    reward = real[A_COLLISION] * event[E_ADVERSARY_COLLIDED] + real[A_PROGRESS] * metres + real[A_EXCESS] * waited
     if active:
         reward += real[A_STEP] * real[TICKS_PER_STEP] + real[A_MET] * event[E_INTERCEPTED]
     return reward + real[A_COMPLETED] * event[E_COMPLETED] + real[A_FAILED] * event[E_FAILED]

@@ -79,7 +79,7 @@ class BatchedArenas:
         end_on_completion: bool = False,
         full_observation: bool = False,
         max_cycles: int | None = None,
-        adversary_rewards: AdversaryRewards | None = None,
+        adversary_rewards: AdversaryRewards | str | None = None,
         workers: int = 1,
     ) -> None:
         """`tasks` are drawn from by `begin`; `workers` threads share the arenas, with the same outcome for any number of
@@ -101,7 +101,7 @@ class BatchedArenas:
                 "one batch needs one kind of ego"
             )
         self.observed_by_ego = len(next(iter(rows)))
-        self._duels = _duels([task.scenario for task in tasks], adversary_rewards or AdversaryRewards(), max_cycles)
+        self._duels = _duels([task.scenario for task in tasks], AdversaryRewards.of(adversary_rewards), max_cycles)
         self._end_on_completion = end_on_completion
         self._full = full_observation
         self.task = np.zeros(arenas, dtype=np.int64)
@@ -110,7 +110,9 @@ class BatchedArenas:
         """``[N, 2, 5]`` x, y, theta, v, w of ego and adversary."""
         self.location = np.full(arenas, FAILED, dtype=np.int64)
         self.clocks = np.full((arenas, 3), -1, dtype=np.int32)
-        self._memory = np.zeros((arenas, 2), dtype=np.int32)
+        self.memory = np.zeros((arenas, 2), dtype=np.int32)
+        """``[N, 2]`` via points that the adversary passed, whether it dropped its styled route."""
+        self._potential = np.zeros((arenas, 2))
         self._counter = np.zeros((arenas, k.COUNTERS), dtype=np.int64)
         self._ego = np.zeros((arenas, self.observed_by_ego), dtype=np.float32)
         self._adversary = np.zeros((arenas, OBSERVED), dtype=np.float32)
@@ -121,6 +123,11 @@ class BatchedArenas:
     def steps(self) -> NDArray[np.int64]:
         """``[N]`` control steps since the episode began."""
         return self._counter[:, k.STEPS].copy()
+
+    @property
+    def visits(self) -> NDArray[np.int64]:
+        """``[N]`` visits that counted for the adversary's mission since the episode began."""
+        return self._counter[:, k.VISITS].copy()
 
     def begin(
         self,
@@ -139,7 +146,7 @@ class BatchedArenas:
         self.task[which] = chosen
         k.begin_many(
             self.bank.tables, self._duels, which, self.task, starts, self._full, self.robots, self.location,
-            self.clocks, self._memory, self._counter, self._ego, self._adversary,
+            self.clocks, self.memory, self._potential, self._counter, self._ego, self._adversary,
         )  # fmt: skip
         return self._ego.copy(), self._adversary.copy()
 
@@ -163,8 +170,8 @@ class BatchedArenas:
         def share(rows: slice) -> None:
             k.step_many(
                 self.bank.tables, self._duels, self.task[rows], given[0][rows], given[1][rows], self._end_on_completion,
-                self._full, self.robots[rows], self.location[rows], self.clocks[rows], self._memory[rows],
-                self._counter[rows], rewards[rows], terminated[rows], truncated[rows], events[rows], self._ego[rows],
+                self._full, self.robots[rows], self.location[rows], self.clocks[rows], self.memory[rows],
+                self._potential[rows], self._counter[rows], rewards[rows], terminated[rows], truncated[rows], events[rows], self._ego[rows],
                 self._adversary[rows],
             )  # fmt: skip
 
@@ -225,6 +232,7 @@ def _duels(scenarios: Sequence[Scenario], prices: AdversaryRewards, max_cycles: 
             pay.interception, pay.collision, pay.per_step, pay.control, pay.mission_completed, pay.encounter,
             pay.arrival, pay.watched,
             prices.completed, prices.failed, prices.intercepted, prices.collision, prices.per_step,
+            prices.progress, prices.excess,
             *((0.0, 0.0) if scenario.ego_goal is None else scenario.ego_goal.centre),
         )  # fmt: skip
         for c, checkpoint in enumerate(scenario.checkpoints):

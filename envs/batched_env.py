@@ -59,7 +59,7 @@ class BatchedEnv(VectorEnv[Array, Array, NDArray[Any]]):
         end_on_completion: bool = True,
         full_observation: bool = False,
         max_cycles: int | None = None,
-        adversary_rewards: AdversaryRewards | None = None,
+        adversary_rewards: AdversaryRewards | str | None = None,
         tasks: int | None = None,
         render_mode: None = None,
         task: Task | TaskSource | None = None,
@@ -227,7 +227,10 @@ class _Batch:
         self._player, self._arenas = player, arenas
         self.style = getattr(player, "style", None)
 
-    def begin(self, which: NDArray[np.int64], tasks: Sequence[Task], rng: np.random.Generator) -> None: ...
+    def begin(self, which: NDArray[np.int64], tasks: Sequence[Task], rng: np.random.Generator) -> None:
+        begin = getattr(self._player, "begin", None)  # of recurrent policies, which forget these episodes
+        if begin is not None:
+            begin(which)
 
     def act(self, observations: Array) -> Array:
         actions = np.asarray(self._player.act(observations), dtype=np.float32)

@@ -18,6 +18,7 @@ from tab_marl.envs.adversary_kernels import (
     RADIUS,
     SUBSTEPS,
     TICK_SECONDS,
+    gained,
     observe,
     task_advance,
 )
@@ -96,12 +97,11 @@ def step_many(
         if after == FAILED:
             reward[i] = value + price[4]
             continue
-        owed = potential[i, 1]
         length, excess = observe_ghost(bank, k, state[i], clocks[i], after, memory[i], ghost[i], seen_metres, out[i])
-        if memory[i, 1] == dropped and memory[i, 0] == via:
-            value += price[0] * (potential[i, 0] - length)
-        if after == before and memory[i, 1] == dropped:
-            value += price[1] * (owed - excess)
+        metres, waited = gained(
+            before, after, via, dropped, memory[i], potential[i, 0], potential[i, 1], length, excess
+        )  # fmt: skip
+        value += price[0] * metres + price[1] * waited
         if excess <= 0.0:
             value += price[6]
         potential[i, 0], potential[i, 1] = length, excess

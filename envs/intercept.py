@@ -61,7 +61,7 @@ class InterceptEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
         end_on_completion: bool = False,
         full_observation: bool = False,
         max_cycles: int | None = None,
-        adversary_rewards: AdversaryRewards | None = None,
+        adversary_rewards: AdversaryRewards | str | None = None,
         show_lidar: bool = False,
         actions: ActionKind = "continuous",
         ego_task: EgoTask | None = None,
@@ -77,6 +77,7 @@ class InterceptEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
         `end_on_completion`: the episode also ends when the mission is completed or fails.
         `full_observation`: the ego sees the adversary always.
         `max_cycles`: the most control steps, if fewer than the horizon's.
+        `adversary_rewards`: "plain" (None), "shaped", or an AdversaryRewards.
         `actions`: "continuous" or "discrete", for both agents.
         """
         if max_cycles is not None and max_cycles < 1:
@@ -86,7 +87,7 @@ class InterceptEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
         self.full_observation = full_observation
         self.max_cycles = max_cycles
         self.adversary_style = as_style(adversary_style)
-        self.adversary_rewards = adversary_rewards or AdversaryRewards()
+        self.adversary_rewards = AdversaryRewards.of(adversary_rewards)
         self.possible_agents = list(AGENTS)
         self.agents: list[str] = []
         self._source = task_source(
@@ -194,15 +195,16 @@ class InterceptEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
         ended = episode.ended or (self.end_on_completion and (events.completed or events.failed))
         truncated = not ended and episode.control_steps >= self._last_step
         seconds = self._control_seconds
+        observations = self._observe()
         rewards = {
             EGO_AGENT: ego_reward(events, episode.motion[0], scenario, seconds),
-            ADVERSARY_AGENT: adversary_reward(events, self.adversary_rewards, scenario, seconds),
+            ADVERSARY_AGENT: adversary_reward(events, self.adversary_rewards, scenario, seconds, self._side.gained),
         }
         self._over = ended or truncated
         if self._over:
             self.agents = []
         result = (
-            self._observe(),
+            observations,
             rewards,
             {EGO_AGENT: ended, ADVERSARY_AGENT: ended},
             {EGO_AGENT: truncated, ADVERSARY_AGENT: truncated},

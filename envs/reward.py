@@ -15,7 +15,8 @@ arrival             avoidance                   once, when the ego is in its goa
 watched             surveillance                per second, while the ego watches the adversary
 ==================  ==========================  ==================================================================
 
-The adversary's are the plain default below; learned adversaries are trained with a shaped one. It is hunted in
+The adversary's are the plain ones below by default. They are sparse: `SHAPED` ones, which `adversary_rewards="shaped"`
+asks for, also pay for every metre of progress along the route, and a learner needs them. The adversary is hunted in
 interception only: meeting the ego costs it nothing in the other tasks.
 """
 
@@ -25,7 +26,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from tab_marl.envs.physics import Motion
-from tab_marl.world.scenario import Scenario
+from tab_marl.world.scenario import Scenario, UnknownName
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,44 @@ class AdversaryRewards:
     """Each time it starts touching a wall or an obstacle."""
     per_step: float = -0.1
     """Per tick of `Scenario.step_seconds`, while its mission is under way."""
+    progress: float = 0.0
+    """Per metre by which the distance-to-go drops, along the plain route through all remaining visits; what is left is
+    paid at completion (potential-based shaping, Ng, Harada and Russell 1999)."""
+    excess: float = 0.0
+    """Per metre (seconds x top speed) by which the excess time before an arrival time drops: who comes early must wait."""
+
+    @classmethod
+    def of(cls, prices: AdversaryRewards | str | None) -> AdversaryRewards:
+        """Prices as they are, by name ("plain", "shaped"), or None for the plain ones. Raises UnknownName, TypeError."""
+        if prices is None:
+            return PLAIN
+        if isinstance(prices, str):
+            if prices not in PRICES:
+                raise UnknownName("adversary_rewards", prices, PRICES)
+            return PRICES[prices]
+        if not isinstance(prices, cls):
+            raise TypeError(
+                f"adversary_rewards is {prices!r}, must be an AdversaryRewards, one of {list(PRICES)}, or None"
+            )
+        return prices
+
+
+PLAIN = AdversaryRewards()
+SHAPED = AdversaryRewards(
+    completed=4.0, failed=-3.0, intercepted=-4.0, collision=-0.05, per_step=-0.05, progress=2.0, excess=4.0
+)
+"""Of the size that the batched training world pays (`batched.Prices`)."""
+PRICES = {"plain": PLAIN, "shaped": SHAPED}
+
+
+class Gained(NamedTuple):
+    """What a step brought along the route, in metres (`adversary_kernels.gained`)."""
+
+    metres: float = 0.0
+    excess: float = 0.0
+
+
+NOTHING = Gained()
 
 
 class Events(NamedTuple):
@@ -86,9 +125,13 @@ def ego_reward(events: Events, motion: Motion, scenario: Scenario, seconds: floa
     return reward
 
 
-def adversary_reward(events: Events, prices: AdversaryRewards, scenario: Scenario, seconds: float) -> float:
-    """The adversary's plain reward over a control step of so many seconds."""
-    reward = prices.collision if events.adversary_collided else 0.0
+def adversary_reward(
+    events: Events, prices: AdversaryRewards, scenario: Scenario, seconds: float, gained: Gained = NOTHING
+) -> float:
+    """The adversary's reward over a control step of so many seconds."""
+    reward = prices.progress * gained.metres + prices.excess * gained.excess
+    if events.adversary_collided:
+        reward += prices.collision
     if events.mission_active:
         reward += prices.per_step * seconds / scenario.step_seconds
         if events.intercepted:

@@ -70,7 +70,7 @@ class TeamEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
         end_on_completion: bool = False,
         full_observation: bool = False,
         max_cycles: int | None = None,
-        adversary_rewards: AdversaryRewards | None = None,
+        adversary_rewards: AdversaryRewards | str | None = None,
         show_lidar: bool = False,
         actions: ActionKind = "continuous",
         adversary_sees_ego_metres: float | None = None,
@@ -89,7 +89,7 @@ class TeamEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
         self.end_on_completion, self.full_observation = end_on_completion, full_observation
         self.max_cycles = max_cycles
         self.adversary_style = as_style(adversary_style)
-        self.adversary_rewards = adversary_rewards or AdversaryRewards()
+        self.adversary_rewards = AdversaryRewards.of(adversary_rewards)
         self.action_kind = check_kind(actions)
         self.ego_agents = tuple(f"ego_{k}" for k in range(egos))
         self.adversary_agents = tuple(f"adversary_{j}" for j in range(adversaries))
@@ -285,7 +285,7 @@ class TeamEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.float32]]):
                     events.intercepted[j], events.completed[j], events.failed[j], False,
                     events.collided[episode.egos + j], events.active[j],
                 )  # fmt: skip
-                paid[agent] = adversary_reward(own, self.adversary_rewards, scenario, seconds)
+                paid[agent] = adversary_reward(own, self.adversary_rewards, scenario, seconds, self._sides[j].gained)
         return paid
 
     def _infos(self, events: TeamEvents) -> Infos:

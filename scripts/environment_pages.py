@@ -55,7 +55,7 @@ ARGUMENTS = {
     "end_on_completion": "the episode also ends when the mission is completed or fails",
     "full_observation": "the ego always sees the adversary",
     "max_cycles": "the most control steps, if fewer than the horizon's",
-    "adversary_rewards": "an `AdversaryRewards`; None: the default prices below",
+    "adversary_rewards": '"plain", "shaped", or an `AdversaryRewards` (below); None: plain',
     "show_lidar": "draw the ego's lidar",
     "actions": "\"continuous\" or \"discrete\"",
     "egos": "how many egos, 1..16",
@@ -264,7 +264,8 @@ def _rewards(env: Any, task: str, scenario: world.Scenario) -> str:
         (t, f"{getattr(scenario.rewards, t):g}", docs[t].split(": ", 1)[-1]) for t in (*COMMON_TERMS, *TERMS[task])
     ]
     theirs = field_docs(reward.AdversaryRewards)
-    prices = [(t, f"{getattr(env.adversary_rewards, t):g}", theirs[t]) for t in theirs]
+    prices = [(t, f"{getattr(reward.PLAIN, t):g}", f"{getattr(reward.SHAPED, t):g}", theirs[t]) for t in theirs]
+    columns = ("term", '"plain"', '"shaped"', "when")
     ticks = f"One time step of `Scenario.step_seconds` is {scenario.step_seconds:g} s; a control step of {1 / scenario.control_hertz:g} s is charged its share."
     note = "" if task == "interception" else " In this ego task meeting the ego costs it nothing."
     team = (
@@ -274,7 +275,7 @@ def _rewards(env: Any, task: str, scenario: world.Scenario) -> str:
     )
     return (
         f"The ego's (`Scenario.rewards`):\n\n{_table(('term', 'price', 'when'), terms)}\n\n{ticks}{team}\n\n"
-        f"The adversary's (`adversary_rewards`):{note}\n\n{_table(('term', 'price', 'when'), prices)}"
+        f"The adversary's (`adversary_rewards`):{note}\n\n{_table(columns, prices)}"
     )
 
 

@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import gymnasium
 import numpy as np
 import pytest
 
 from tab_marl.envs.ego_observation import ego_rows, ego_space, observe_ego, parse_ego_observation
+from tab_marl.envs.opponents import follow_route
 from tab_marl.envs.physics import Motion
-from tab_marl.envs.reward import AdversaryRewards, Events, adversary_reward, ego_reward
-from tab_marl.world.scenario import Scenario, Sensors
+from tab_marl.envs.reward import SHAPED, AdversaryRewards, Events, adversary_reward, ego_reward
+from tab_marl.world.scenario import Scenario, Sensors, UnknownName
 
 OWN = Motion(0.7, 1.9, 2.5, 0.11, -0.6)
 OTHER = Motion(2.2, 0.3, -1.2, 0.2, 1.1)
@@ -72,6 +74,35 @@ def test_ego_reward_is_the_papers(mixed: Scenario) -> None:
     assert ego_reward(Events(completed=True), motion, mixed, 0.1) == pytest.approx(plain - 50)
     paper = Scenario.preset("paper")
     assert ego_reward(Events(completed=True), motion, paper, 0.1) == pytest.approx(plain)
+
+
+@pytest.mark.parametrize("world", ["lab", "random"])
+def test_shaped_reward_telescopes_to_the_way_that_was_to_go(world: str) -> None:
+    """Whatever way a follower takes, progress pays the distance-to-go of its start, and nothing is left at the end."""
+    env = gymnasium.make("tab_marl:tab_marl/Adversary-v0", mission="M3", scenario=world, opponent="static",
+                         adversary_rewards=AdversaryRewards(0.0, 0.0, 0.0, 0.0, 0.0, progress=1.0))  # fmt: skip
+    observation, _ = env.reset(seed=5)
+    inner = env.unwrapped.inner  # type: ignore[attr-defined]
+    side, start = inner._side, inner.episode.motion[1]
+    plain = side.task.parts.plain
+    to_go = float(plain.metres(side.monitor.location, np.array([start.x, start.y]))[0])
+    turn = inner.episode.scenario.adversary.max_turn_rate / inner.episode.scenario.control_hertz
+    total, over = 0.0, False
+    while not over:
+        observation, reward, terminated, truncated, info = env.step(follow_route(observation, turn))
+        total += float(reward)
+        over = terminated or truncated
+    assert info["mission_status"] == "completed"
+    # The way is read off at the point looked ahead to, so it may differ from the field's own by a cell.
+    assert total == pytest.approx(to_go, abs=0.1)
+
+
+def test_prices_by_name() -> None:
+    assert AdversaryRewards.of("shaped") is SHAPED and AdversaryRewards.of(None) == AdversaryRewards()
+    with pytest.raises(UnknownName, match="shaped"):
+        AdversaryRewards.of("shapd")
+    with pytest.raises(TypeError, match="adversary_rewards"):
+        AdversaryRewards.of(3.0)  # type: ignore[arg-type]
 
 
 def test_adversary_reward(mixed: Scenario) -> None:
