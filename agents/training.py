@@ -1,12 +1,11 @@
-"""Training of mission-conditioned adversary policies with stable-baselines3's PPO in the batched world.
+"""Training of mission-conditioned adversary policies with stable-baselines3 and sb3-contrib in the batched world.
 
-A run lives in one folder: its settings, its checkpoint, its TensorBoard log and, at the end, the exported policy. It may
-be killed at any moment; the same call continues it and ends with the same weights as an undisturbed run.
+A run lives in one folder: its settings, its checkpoint, its TensorBoard and CSV logs and, at the end, the exported policy.
+It may be killed at any moment; the same call continues it and ends with the same weights as an undisturbed run.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import time
@@ -17,23 +16,30 @@ from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3 import PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 
-from tab_marl.agents.training_env import TRAINING, BatchedVecEnv, build_bank, draw_tasks
-from tab_marl.agents.training_settings import TrainingError, TrainingSettings
+from tab_marl.agents.training_algorithms import ALGORITHMS
+from tab_marl.agents.training_checkpoint import CHECKPOINT_FILE, Checkpoint, Exploration
+from tab_marl.agents.training_env import TRAINING, BatchedVecEnv, build_bank, difficulties, draw_tasks
+from tab_marl.agents.training_hyperparameters import HyperparameterError, arguments, check
+from tab_marl.agents.training_initial import begin_with
+from tab_marl.agents.training_log import LOG_FILE, ROWS, LearningLog
+from tab_marl.agents.training_settings import UNOPPOSED, TrainingError, TrainingSettings
+
+__all__ = ["CHECKPOINT_FILE", "LOG_FILE", "LOG_FOLDER", "SETTINGS_FILE", "OnProgress", "Progress", "train"]
 
 SETTINGS_FILE = "settings.toml"
-CHECKPOINT_FILE = "checkpoint.pt"
 LOG_FOLDER = "tensorboard"
-CHECKPOINT_VERSION = 1
 EXACT_MISSION = "M2"
+NOT_PART_OF_A_RUN = ("checkpoint_seconds", "description", "split")
+"""Settings that may differ when a run is continued."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a run stands; given to the progress callback after every update and while the tasks are built."""
+    """Where a run stands; given to the progress callback after every row of the log and while the tasks are built."""
 
     phase: str
     """ "tasks" while the bank is built, then "training"."""
@@ -44,21 +50,27 @@ class Progress:
     """Learning included, since this process began or continued the run; 0 while building."""
     success: dict[str, float]
     """Share of completed missions per mission type over the last episodes, action noise on; nan before the first."""
+    cpu_seconds: float = 0.0
+    """Of the whole run so far."""
 
 
 OnProgress = Callable[[Progress], None]
 
 
-def train(settings: TrainingSettings, out_dir: Path | str, on_progress: OnProgress | None = None) -> PPO:
+def train(settings: TrainingSettings, out_dir: Path | str, on_progress: OnProgress | None = None) -> Any:
     """Train, or continue, the run in `out_dir`; returns the trained model (export it with `zoo.export_policy`).
 
-    Writes ``settings.toml``, ``checkpoint.pt`` (replaced atomically, read back without unpickling code) and
-    ``tensorboard/`` in `out_dir`. A finished run returns at once.
+    Writes ``settings.toml``, ``checkpoint.pt`` (replaced atomically, read back without unpickling code), ``replay/``
+    while an off-policy algorithm learns, ``log.csv`` and ``tensorboard/`` in `out_dir`. A finished run returns at once.
 
-    Raises TrainingError if the folder holds a run with other settings or an unreadable checkpoint, OSError if it
-    cannot be written.
+    Raises TrainingError if the folder holds a run with other settings or an unreadable checkpoint, or for a
+    hyperparameter that the algorithm does not have; OSError if the folder cannot be written.
     """
     folder = Path(out_dir)
+    try:
+        check(settings.algorithm, settings.hyperparameters)
+    except HyperparameterError as error:
+        raise TrainingError(str(error)) from None
     _claim(folder, settings)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # the networks are small: one thread is fastest, and results do not depend on the machine
@@ -76,68 +88,120 @@ def _claim(folder: Path, settings: TrainingSettings) -> None:
         theirs = TrainingSettings.from_toml(path)
         for f in fields(settings):
             mine, their = getattr(settings, f.name), getattr(theirs, f.name)
-            if mine != their and f.name != "checkpoint_seconds":
+            if mine != their and f.name not in NOT_PART_OF_A_RUN:
                 raise TrainingError(
                     f"{folder} holds a run with {f.name} = {their!r}, asked for {mine!r}: "
                     "continue it with its own settings or choose another folder"
                 )
-        return
-    _write_atomically(path, settings.to_toml().encode())
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_bytes(settings.to_toml().encode())
+    os.replace(temporary, path)
 
 
-def _train(settings: TrainingSettings, folder: Path, on_progress: OnProgress | None) -> PPO:
+def _train(settings: TrainingSettings, folder: Path, on_progress: OnProgress | None) -> Any:
+    clock = _Clock()
+    env = _environment(settings, on_progress)
+    model = build_model(settings, env)
+    checkpoint = Checkpoint(folder)
+    if checkpoint.exists():
+        clock.continue_from(checkpoint.restore(model, env))
+    elif settings.initial:
+        begin_with(model, settings.initial)
+    log = LearningLog(folder, sorted(set(env.kinds)), model.num_timesteps)
+    model.set_logger(configure(str(folder / LOG_FOLDER), ["tensorboard"]))
+    remaining = settings.steps - model.num_timesteps
+    if remaining > 0:
+        watch = _Watch(settings, env, checkpoint, log, clock, on_progress)
+        # The log is written by the watch: the algorithms would write theirs every few episodes.
+        model.learn(remaining, callback=watch, log_interval=None, reset_num_timesteps=False)
+        model.logger.close()
+        checkpoint.save(model, env, clock.record(), finished=True)
+    return model
+
+
+def _environment(settings: TrainingSettings, on_progress: OnProgress | None) -> Any:
+    """The VecEnv that the settings ask for."""
+
     def built(done: int, total: int) -> None:
         if on_progress is not None and (done % 20 == 0 or done == total):
             on_progress(Progress("tasks", done, total, 0.0, {}))
 
-    tasks = draw_tasks(TRAINING, settings.seed, settings.tasks, settings.missions, settings.families)
-    bank = build_bank(tasks, settings.style, settings.seed, built)
+    tasks = draw_tasks(
+        TRAINING, settings.seed, settings.tasks, settings.missions, settings.families, settings.map, settings.difficulty
+    )
     kinds = [task.mission_id for task in tasks]
-    env = BatchedVecEnv(bank, kinds, settings.robots, settings.seed, settings.ego_seen_metres)
-    model = _model(settings, env)
-    checkpoint = folder / CHECKPOINT_FILE
-    continues = checkpoint.exists()
-    if continues:
-        _restore(model, env, checkpoint)
-    model.set_logger(configure(str(folder / LOG_FOLDER), ["tensorboard"]))
-    remaining = settings.steps - model.num_timesteps
-    if remaining > 0:
-        watch = _Watch(settings, env, checkpoint, on_progress)
-        model.learn(remaining, callback=watch, log_interval=1, reset_num_timesteps=False)
-        model.logger.close()
-        _save(model, env, checkpoint)
+    if settings.opponent == UNOPPOSED:
+        bank = build_bank(tasks, settings.style, settings.seed, built)
+        return BatchedVecEnv(bank, kinds, settings.robots, settings.seed, settings.ego_seen_metres)
+    from tab_marl.agents.hunted_env import HuntedVecEnv, hunted_tasks
+
+    hunted = hunted_tasks(tasks, settings.style, settings.seed, 1, settings.ego_seen_metres)
+    built(len(hunted), len(hunted))
+    return HuntedVecEnv(hunted, kinds, settings.robots, settings.seed, settings.opponent)
+
+
+def build_model(settings: TrainingSettings, env: Any) -> BaseAlgorithm:
+    """The untrained model of these settings. Raises TrainingError."""
+    hyperparameters = settings.hyperparameters
+    given = arguments(hyperparameters)
+    policy = given.pop("policy", "MlpPolicy")
+    if "n_steps" in given and "batch_size" in given and "buffer_size" not in given:
+        given["batch_size"] = min(given["batch_size"], settings.robots * given["n_steps"])
+    if "noise_type" in hyperparameters or "noise_std" in hyperparameters:
+        given["action_noise"] = Exploration(settings.robots, float(hyperparameters["noise_std"]), settings.seed)
+    try:
+        model: BaseAlgorithm = ALGORITHMS[settings.algorithm].load()(
+            policy, env, seed=settings.seed, device="cpu", **given
+        )
+    except (TypeError, ValueError, AssertionError) as error:
+        raise TrainingError(
+            f"{settings.name}: {ALGORITHMS[settings.algorithm].title} does not take these hyperparameters ({error})"
+        ) from None
     return model
 
 
-def _model(settings: TrainingSettings, env: BatchedVecEnv) -> PPO:
-    first, last = settings.learning_rate, settings.final_learning_rate
-    return PPO(
-        "MlpPolicy",
-        env,
-        learning_rate=lambda remaining: last + (first - last) * max(remaining, 0.0),
-        n_steps=settings.rollout_steps,
-        batch_size=min(settings.batch, settings.robots * settings.rollout_steps),
-        n_epochs=settings.epochs,
-        gamma=settings.discount,
-        gae_lambda=settings.gae_lambda,
-        clip_range=settings.clip,
-        ent_coef=settings.entropy,
-        policy_kwargs={"net_arch": list(settings.layers), "activation_fn": torch.nn.Tanh},
-        seed=settings.seed,
-        device="cpu",
-    )
+class _Clock:
+    """Seconds that a run has taken, over all processes that worked on it."""
+
+    def __init__(self) -> None:
+        self._began, self._cpu_began = time.monotonic(), time.process_time()
+        self._before = self._cpu_before = 0.0
+
+    def continue_from(self, record: dict[str, float]) -> None:
+        self._before, self._cpu_before = record["seconds"], record["cpu_seconds"]
+
+    @property
+    def seconds(self) -> float:
+        return self._before + time.monotonic() - self._began
+
+    @property
+    def cpu_seconds(self) -> float:
+        return self._cpu_before + time.process_time() - self._cpu_began
+
+    def record(self) -> dict[str, float]:
+        return {"seconds": self.seconds, "cpu_seconds": self.cpu_seconds}
 
 
 class _Watch(BaseCallback):
-    """Between updates: the final phase, checkpoints, the log and the progress callback."""
+    """Between updates: the phases of a run, checkpoints, the logs and the progress callback."""
 
     def __init__(
-        self, settings: TrainingSettings, env: BatchedVecEnv, checkpoint: Path, on_progress: OnProgress | None
+        self,
+        settings: TrainingSettings,
+        env: Any,
+        checkpoint: Checkpoint,
+        log: LearningLog,
+        clock: _Clock,
+        on_progress: OnProgress | None,
     ) -> None:
         super().__init__()
-        self._settings, self._env, self._checkpoint, self._on_progress = settings, env, checkpoint, on_progress
+        self._settings, self._env, self._checkpoint = settings, env, checkpoint
+        self._log, self._clock, self._on_progress = log, clock, on_progress
         self._began = self._saved = time.monotonic()
         self._first_step: int | None = None
+        self._before = 0
+        self._row_steps = max(settings.steps // ROWS, 1)
+        self._weights = Sampler(settings, env.kinds)
 
     def _on_step(self) -> bool:
         return True
@@ -146,96 +210,66 @@ class _Watch(BaseCallback):
         if self._first_step is None:
             self._first_step = self.num_timesteps
         elif time.monotonic() - self._saved >= self._settings.checkpoint_seconds:
-            assert isinstance(self.model, PPO)
-            _save(self.model, self._env, self._checkpoint)
+            self._checkpoint.save(self.model, self._env, self._clock.record())
             self._saved = time.monotonic()
-        if self.num_timesteps >= (1.0 - self._settings.final_share) * self._settings.steps:
-            self._finish()
-
-    def _finish(self) -> None:
-        """The last part: little action noise, and exact-time missions twice as often."""
-        policy: Any = self.model.policy
-        policy.log_std.data.fill_(math.log(self._settings.final_std))
-        weights = np.where(np.array(self._env.kinds) == EXACT_MISSION, 2.0, 1.0)
-        self._env.weights = weights / weights.sum()
+        self._before = self.num_timesteps
+        self._env.weights = self._weights(self.num_timesteps)
+        if self.num_timesteps >= self._settings.final_step:
+            _quieten(self.model, self._settings.final_std)
 
     def _on_rollout_end(self) -> None:
+        if self._before // self._row_steps == self.num_timesteps // self._row_steps:
+            return
         success = self._env.success()
+        episodes = [episode["r"] for episode in self.model.ep_info_buffer or ()]
+        seconds, cpu_seconds = self._clock.seconds, self._clock.cpu_seconds
+        self._log.row(
+            self.num_timesteps,
+            self.model._n_updates,  # type: ignore[attr-defined]
+            seconds,
+            cpu_seconds,
+            float(np.mean(episodes)) if episodes else math.nan,
+            success,
+        )
         for mission, share in success.items():
             if not math.isnan(share):
                 self.logger.record(f"success/{mission}", share)
+        self.logger.record("time/cpu_seconds", cpu_seconds)
+        self.model.dump_logs()  # type: ignore[attr-defined]
         if self._on_progress is not None:
             assert self._first_step is not None
             rate = (self.num_timesteps - self._first_step) / max(time.monotonic() - self._began, 1e-9)
-            self._on_progress(Progress("training", self.num_timesteps, self._settings.steps, rate, success))
+            self._on_progress(
+                Progress("training", self.num_timesteps, self._settings.steps, rate, success, cpu_seconds)
+            )
 
 
-def _save(model: PPO, env: BatchedVecEnv, path: Path) -> None:
-    """Everything that the rest of the run depends on, as tensors and one JSON text."""
-    world = env.world
-    arrays = {
-        "task": world.task, "state": world.state, "location": world.location, "clocks": world.clocks,
-        "memory": world.memory, "ghost": world.ghost, "potential": world.potential, "observation": world.observation,
-        "returns": env.returns, "ticks": env.ticks, "episode_starts": model._last_episode_starts,
-    }  # fmt: skip
-    record = {
-        "version": CHECKPOINT_VERSION,
-        "steps": model.num_timesteps,
-        "updates": model._n_updates,
-        "policy": model.policy.state_dict(),
-        "optimizer": model.policy.optimizer.state_dict(),
-        "torch_random": torch.get_rng_state(),
-        "arrays": {name: torch.from_numpy(np.array(array)) for name, array in arrays.items()},
-        "text": json.dumps(
-            {
-                "world_random": world.rng.bit_generator.state,
-                "shuffle_random": _global_random(),
-                "recent": env.recent,
-            }
-        ),
-    }
-    temporary = path.with_suffix(".tmp")
-    with temporary.open("wb") as file:
-        torch.save(record, file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+def _quieten(model: Any, std: float) -> None:
+    """Little action noise, where the noise is not the algorithm's to choose (SAC and TQC weigh it against the reward)."""
+    if hasattr(model.policy, "log_std"):
+        model.policy.log_std.data.fill_(math.log(std))
+    elif getattr(model, "action_noise", None) is not None:
+        model.action_noise.std = min(model.action_noise.std, std)
 
 
-def _global_random() -> tuple[Any, ...]:
-    # stable-baselines3 shuffles its minibatches with numpy's global generator, which it seeds itself.
-    name, keys, position, has_gauss, cached = np.random.get_state()  # noqa: NPY002
-    return name, [int(key) for key in keys], int(position), int(has_gauss), float(cached)
+class Sampler:
+    """The probability of each task of the bank as the run goes on; a function of the control steps alone."""
 
+    def __init__(self, settings: TrainingSettings, kinds: tuple[str, ...]) -> None:
+        self._settings = settings
+        self._exact = np.where(np.array(kinds) == EXACT_MISSION, 2.0, 1.0)
+        self._hardness = np.zeros(len(kinds))
+        if settings.difficulty is not None:
+            self._hardness = np.array(difficulties(TRAINING, settings.seed, len(kinds), settings.difficulty))
 
-def _restore(model: PPO, env: BatchedVecEnv, path: Path) -> None:
-    try:
-        record = torch.load(path, weights_only=True)
-        text = json.loads(record["text"])
-        version = record["version"]
-    except Exception as error:  # noqa: BLE001, a damaged file makes torch raise almost anything
-        raise TrainingError(
-            f"cannot read the checkpoint {path} ({type(error).__name__}): delete it to begin the run anew"
-        ) from None
-    if version != CHECKPOINT_VERSION:
-        raise TrainingError(f"{path} is a version {version} checkpoint, this program reads {CHECKPOINT_VERSION}")
-    model.policy.load_state_dict(record["policy"])
-    model.policy.optimizer.load_state_dict(record["optimizer"])
-    model.num_timesteps, model._n_updates = record["steps"], record["updates"]
-    arrays = {name: tensor.numpy() for name, tensor in record["arrays"].items()}
-    for name in ("task", "state", "location", "clocks", "memory", "ghost", "potential", "observation"):
-        getattr(env.world, name)[:] = arrays[name]
-    env.returns[:], env.ticks[:] = arrays["returns"], arrays["ticks"]
-    env.recent = text["recent"]
-    env.world.rng.bit_generator.state = text["world_random"]
-    model._last_obs = env.world.observation.copy()
-    model._last_episode_starts = arrays["episode_starts"].copy()
-    torch.set_rng_state(record["torch_random"])
-    name, keys, position, has_gauss, cached = text["shuffle_random"]
-    np.random.set_state((name, np.array(keys, dtype=np.uint32), position, has_gauss, cached))  # noqa: NPY002
-
-
-def _write_atomically(path: Path, content: bytes) -> None:
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_bytes(content)
-    os.replace(temporary, path)
+    def __call__(self, steps: int) -> np.ndarray[Any, np.dtype[np.float64]]:
+        """``[K]``, summing to 1."""
+        settings = self._settings
+        weights = self._exact if steps >= settings.final_step else np.ones(len(self._exact))
+        rising = settings.curriculum_share * settings.steps
+        if steps < rising and settings.difficulty is not None:
+            low, high = settings.difficulty
+            weights = np.where(self._hardness <= low + (high - low) * steps / rising, weights, 0.0)
+            if not weights.any():
+                weights = (self._hardness == self._hardness.min()).astype(float)
+        return np.asarray(weights / weights.sum())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,9 @@ from stable_baselines3.common.vec_env import VecEnv
 from tab_marl.envs.adversary_observation import AdversaryTask, observation_bounds
 from tab_marl.envs.batched import Bank, BatchedWorld
 from tab_marl.envs.styles import Style
+from tab_marl.mission.curriculum import Curriculum
 from tab_marl.mission.tasks import Task, sample_task
+from tab_marl.world.sampling import MapOptions
 
 TRAINING, HELD_OUT = 1, 2
 """Streams of tasks that never share a random number."""
@@ -21,13 +23,35 @@ WINDOW = 400
 """Episodes over which success is averaged for the log."""
 
 
-def draw_tasks(stream: int, seed: int, count: int, missions: Sequence[str], families: Sequence[str]) -> list[Task]:
-    """`count` tasks, missions and families in turn; task i depends on (stream, seed, i) only."""
+def draw_tasks(
+    stream: int,
+    seed: int,
+    count: int,
+    missions: Sequence[str],
+    families: Sequence[str],
+    options: MapOptions | None = None,
+    difficulty: tuple[float, float] | None = None,
+) -> list[Task]:
+    """`count` tasks, missions and families in turn; task i depends on (stream, seed, i) only.
+
+    options: of the maps. difficulty: the range in which the curriculum draws each task; see `difficulties`.
+    """
     kinds = [(mission, family) for family in families for mission in missions]
+    generators = [np.random.default_rng((stream, seed, i)) for i in range(count)]
+    turn = [kinds[i % len(kinds)] for i in range(count)]
+    if difficulty is None:
+        return [sample_task(rng, *kind, options=options) for rng, kind in zip(generators, turn, strict=True)]
+    hardness = difficulties(stream, seed, count, difficulty)
+    curriculum = Curriculum()
     return [
-        sample_task(np.random.default_rng((stream, seed, i)), *kinds[i % len(kinds)])
-        for i in range(count)
+        curriculum.sample_task(rng, hard, *kind)
+        for rng, hard, kind in zip(generators, hardness, turn, strict=True)
     ]  # fmt: skip
+
+
+def difficulties(stream: int, seed: int, count: int, bounds: tuple[float, float]) -> list[float]:
+    """The difficulty ``[count]`` of each task that `draw_tasks` draws, uniform within the bounds."""
+    return [float(np.random.default_rng((stream, seed, i, 1)).uniform(*bounds)) for i in range(count)]
 
 
 def build_bank(
@@ -50,6 +74,8 @@ class BatchedVecEnv(VecEnv):
     """
 
     render_mode = None
+    KEPT = ("task", "state", "location", "clocks", "memory", "ghost", "potential", "observation")
+    """Arrays of the world that the rest of a run depends on."""
 
     def __init__(self, bank: Bank, kinds: Sequence[str], robots: int, seed: int, seen_metres: float = 0.0) -> None:
         low, high = observation_bounds()
@@ -103,6 +129,20 @@ class BatchedVecEnv(VecEnv):
     def success(self) -> dict[str, float]:
         """Share of completed missions per mission type over the last episodes (nan before the first)."""
         return {kind: float(np.mean(recent)) if recent else float("nan") for kind, recent in self.recent.items()}
+
+    def snapshot(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+        """Everything that the rest of a run depends on: arrays by name, and what goes into JSON."""
+        arrays = {name: np.array(getattr(self.world, name)) for name in self.KEPT}
+        arrays |= {"returns": self.returns.copy(), "ticks": self.ticks.copy()}
+        return arrays, {"random": self.world.rng.bit_generator.state, "recent": self.recent}
+
+    def restore(self, arrays: Mapping[str, NDArray[Any]], text: Mapping[str, Any]) -> None:
+        """Go on from a snapshot."""
+        for name in self.KEPT:
+            getattr(self.world, name)[:] = arrays[name]
+        self.returns[:], self.ticks[:] = arrays["returns"], arrays["ticks"]
+        self.world.rng.bit_generator.state = text["random"]
+        self.recent = {kind: list(shares) for kind, shares in text["recent"].items()}
 
     # What VecEnv asks for beside that; there is one world, so no per-robot attributes.
     def close(self) -> None:

@@ -20,7 +20,8 @@ from tab_marl.envs.styles import STYLES, Style
 from tab_marl.world.scenario import UnknownName
 
 SMALL = TrainingSettings(
-    name="small", missions=("M1",), families=("point",), tasks=4, robots=8, rollout_steps=32, batch=128, epochs=2,
+    name="small", missions=("M1",), families=("point",), tasks=4, robots=8,
+    hyperparameters={"n_steps": 32, "batch_size": 128, "n_epochs": 2},
     layers=(16,), steps=8 * 32 * 12, final_share=0.3, checkpoint_seconds=0.001,
 )  # fmt: skip
 
@@ -181,7 +182,7 @@ def test_toml_may_name_a_style_and_leave_the_rest(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("steps = 0", "steps is 0, must be >= 1"),
+        ("steps = -1", "steps is -1, must be >= 1"),
         ("stepz = 5", "stepz"),
         ('steps = "many"', "steps"),
         ('style = "viaa"', "did you mean 'via'"),
@@ -189,7 +190,13 @@ def test_toml_may_name_a_style_and_leave_the_rest(tmp_path):
         ('name = "a/b"', "usable as a folder's name"),
         ("steps = ", "cannot read training settings"),
         ("[style]\nside = 3.0", "side is 3.0"),
-        ("discount = 1.5", "discount is 1.5, must lie in 0..1"),
+        ("final_share = 1.5", "final_share is 1.5, must lie in 0..1"),
+        ('algorithm = "sacc"', "did you mean 'sac'"),
+        ('activation = "gelu"', "gelu"),
+        ("lstm_units = 8", "ppo has no LSTM"),
+        ("difficulty = [0.9, 0.1]", "must be 0 <= easiest <= hardest <= 1"),
+        ("curriculum_share = 0.5", "needs difficulty"),
+        ('[hyperparameters]\npolicy_kwargs = "__import__(1)"', "calls something other than dict"),
     ],
 )
 def test_bad_settings_are_refused_in_one_line(tmp_path, text, said):
@@ -239,8 +246,8 @@ def test_the_vector_environment_keeps_stable_baselines3s_rules():
 def test_a_quarter_of_a_minute_of_training_learns_to_reach_a_checkpoint(tmp_path):
     """From nothing to half of the missions of one type on a few maps."""
     settings = TrainingSettings(
-        name="quick", missions=("M1",), families=("point",), tasks=12, steps=60_000, robots=32, rollout_steps=64,
-        batch=1024, layers=(32, 32), learning_rate=1e-3, checkpoint_seconds=1e6,
+        name="quick", missions=("M1",), families=("point",), tasks=12, steps=60_000, robots=32,
+        layers=(32, 32), hyperparameters={"n_steps": 64, "batch_size": 1024, "learning_rate": 1e-3}, checkpoint_seconds=1e6,
     )  # fmt: skip
     stands = []
     train(settings, tmp_path, stands.append)
