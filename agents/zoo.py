@@ -29,6 +29,7 @@ from tab_marl.agents.actor import ACTIONS, Actor, ActorError, Memory
 from tab_marl.agents.cards import MissionRecord, PolicyCard, Split, is_name
 from tab_marl.agents.sb3_actors import LOG_STD, actor_of_model
 from tab_marl.agents.training_settings import TrainingSettings
+from tab_marl.envs.adversary_kernels import O_LIMIT
 from tab_marl.envs.adversary_observation import LAYOUT_VERSION, OBSERVED
 from tab_marl.envs.styles import STYLES, Style
 from tab_marl.mission.tasks import Task
@@ -92,12 +93,15 @@ class ZooPolicy:
     def act(self, observation: NDArray[np.float32], rng: np.random.Generator | None = None) -> NDArray[np.float32]:
         """Action ``[2]`` (or ``[N, 2]``) in [-1, 1] for an observation ``[D]`` (or ``[N, D]``).
 
-        `rng` adds the noise that it was trained with, where that is known.
+        `rng` adds the noise that it was trained with, where that is known. The mission's speed limit is kept by a governor,
+        as in the batched world that policies are trained in, not by the network.
         """
-        out = self.actor.raw(observation, self.memory)
+        out: NDArray[Any] = self.actor.raw(observation, self.memory)
         if rng is not None and self.log_std is not None:
             out = out + np.exp(self.log_std) * rng.standard_normal(out.shape, dtype=np.float32)
-        return self.actor.bounded(out)
+        action = self.actor.bounded(out)
+        np.minimum(action[..., 0], 2.0 * observation[..., O_LIMIT] - 1.0, out=action[..., 0])
+        return action
 
 
 def user_zoo() -> Path:

@@ -13,6 +13,7 @@ that knew the adversary's shortest path (to each alternative goal) could meet it
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import permutations
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 
 from tab_marl.mission.model import Constraint, ConstraintType, Mission, Place
 from tab_marl.world.grid import GridMap
+from tab_marl.world.regions import Region
 from tab_marl.world.sampling import PLANNING_CELL_METRES, MapOptions, sample_disc, sample_scenario
 from tab_marl.world.scenario import STRICT, Scenario, UnknownName
 
@@ -130,14 +132,14 @@ def _attempt(
     if legs is None:
         return None
     grid = GridMap.from_scenario(scenario, PLANNING_CELL_METRES)
-    travel = _Travel(scenario, grid, avoid_centre=mission_id in ("M4", "M5"))
+    travel = Travel(scenario, grid, _avoided(scenario, mission_id))
     first = [scenario.place(place) for place in legs[0]]
     clear = scenario.adversary.radius_metres + START_RADIUS_METRES
 
     def far_from_goals(points: NDArray[np.float64]) -> NDArray[np.bool_]:
         ok = np.min([region.distance(points) for region in first], axis=0) >= far_metres
-        if travel.avoid_centre:
-            ok &= scenario.region("central zone").distance(points) >= clear
+        for region in travel.avoided:
+            ok &= region.distance(points) >= clear
         return np.asarray(ok)
 
     start = sample_disc(rng, grid, START_RADIUS_METRES, far_from_goals)
@@ -212,24 +214,28 @@ def _targets(rng: np.random.Generator, scenario: Scenario, count: int) -> tuple[
     return tuple(chosen)
 
 
+def _avoided(scenario: Scenario, mission_id: str) -> tuple[Region, ...]:
+    return (scenario.region("central zone"),) if mission_id in ("M4", "M5") else ()
+
+
 @dataclass(frozen=True)
-class _Way:
-    """One shortest way of completing the mission: the time it takes, its longest leg, and where it is at each tick."""
+class Way:
+    """One shortest way of completing the mission: the time it takes, leg by leg, and where it is at each tick."""
 
     seconds: float
-    longest_leg_seconds: float
+    leg_seconds: tuple[float, ...]
     path: NDArray[np.float64]
     """``[ticks + 1, 2]`` metres."""
 
 
-class _Travel:
-    """Shortest paths of one adversary on one map."""
+class Travel:
+    """Shortest paths of one adversary on one map, out of the regions avoided."""
 
-    def __init__(self, scenario: Scenario, grid: GridMap, avoid_centre: bool) -> None:
-        self.scenario, self.grid, self.avoid_centre = scenario, grid, avoid_centre
-        # Walking through the zone costs so much that a path avoids it wherever it can; a path that cannot is refused.
-        zone = grid.inside(scenario.region("central zone"))
-        self._cost = np.where(zone, 1e6, 1.0) if avoid_centre else None
+    def __init__(self, scenario: Scenario, grid: GridMap, avoided: Sequence[Region] = ()) -> None:
+        self.scenario, self.grid, self.avoided = scenario, grid, tuple(avoided)
+        # Walking through a region costs so much that a path avoids it wherever it can; a path that cannot is refused.
+        zone = np.any([grid.inside(region) for region in avoided], axis=0) if avoided else None
+        self._cost = None if zone is None else np.where(zone, 1e6, 1.0)
         self._from: dict[tuple[Place, ...], NDArray[np.float64]] = {}
 
     def to(self, places: tuple[Place, ...]) -> NDArray[np.float64]:
@@ -242,7 +248,7 @@ class _Travel:
             )
         return self._from[places]
 
-    def ways(self, start: tuple[float, float], legs: list[tuple[Place, ...]], mission_id: str) -> list[_Way]:
+    def ways(self, start: tuple[float, float], legs: list[tuple[Place, ...]], mission_id: str) -> list[Way]:
         """The shortest way for each choice of last goal (M2: of both goals; M5: over the best three checkpoints)."""
         orders: list[tuple[Place, ...]]
         if mission_id == "M2":
@@ -251,7 +257,7 @@ class _Travel:
             orders = [self._best_three(start, legs[0], target) for target in legs[1]]
         else:
             orders = [(goal,) for goal in legs[0]]
-        return [self._walk(start, order) for order in orders]
+        return [self.walk(start, order) for order in orders]
 
     def _best_three(self, start: tuple[float, float], names: tuple[Place, ...], target: Place) -> tuple[Place, ...]:
         cells = {place: int(self.grid.cells_of([self.scenario.place(place).centre])[0]) for place in (*names, target)}
@@ -266,17 +272,16 @@ class _Travel:
 
         return min(((*three, target) for three in permutations(names, 3)), key=length)
 
-    def _walk(self, start: tuple[float, float], order: tuple[Place, ...]) -> _Way:
+    def walk(self, start: tuple[float, float], order: tuple[Place, ...]) -> Way:
         """Descend the distance to each goal in turn, one leg after the other, at full speed."""
         speed, step = self.scenario.adversary.max_speed, self.scenario.step_seconds
         cell = int(self.grid.cells_of([start])[0])
-        points, times, longest = [self.grid.centres[cell]], [0.0], 0.0
+        points, times, legs = [self.grid.centres[cell]], [0.0], []
         for place in order:
             distance = self.to((place,))
             if not distance[cell] < 1e4:
-                return _Way(math.inf, math.inf, np.zeros((1, 2)))
-            leg = TURN_SECONDS + float(distance[cell]) / speed
-            longest = max(longest, leg)
+                return Way(math.inf, (math.inf,), np.zeros((1, 2)))
+            legs.append(TURN_SECONDS + float(distance[cell]) / speed)
             points.append(points[-1])
             times.append(times[-1] + TURN_SECONDS)
             while distance[cell] > 0:
@@ -293,7 +298,7 @@ class _Travel:
         ticks = np.arange(0.0, times[-1] + step, step)
         track = np.asarray(points)
         path = np.stack([np.interp(ticks, times, track[:, 0]), np.interp(ticks, times, track[:, 1])], axis=1)
-        return _Way(times[-1], longest, path)
+        return Way(times[-1], tuple(legs), path)
 
     def ego_meets(self, path: NDArray[np.float64]) -> NDArray[np.bool_]:
         """``[S]``: from which cells an ego that knew this path could be within reach of it in time."""
@@ -307,17 +312,17 @@ class _Travel:
         return meets
 
 
-def _halves(seconds: float) -> float:
+def half_seconds(seconds: float) -> float:
     """Up to the next half second, so that the mission reads well."""
     return math.ceil(2 * seconds - 1e-9) / 2
 
 
 def _mission(
-    mission_id: str, legs: list[tuple[Place, ...]], travel: _Travel, ways: list[_Way], slack: float
+    mission_id: str, legs: list[tuple[Place, ...]], travel: Travel, ways: list[Way], slack: float
 ) -> tuple[Mission, float]:
     """The mission with its deadlines, and the episode's horizon in seconds."""
     longest = max(way.seconds for way in ways)
-    allowed = _halves(slack * longest)
+    allowed = half_seconds(slack * longest)
     avoid_centre = Constraint(ConstraintType.ALWAYS, ("central zone",), avoid=True)
     reach = ConstraintType.DEADLINE
     if mission_id == "M1":
@@ -330,21 +335,21 @@ def _mission(
         )
         end = allowed + max(travel.scenario.exact_seconds, travel.scenario.exact_fraction * allowed)
     elif mission_id == "M3":
-        period = _halves(slack * max(longest, TURN_BACK_SECONDS + TURN_SECONDS))
+        period = half_seconds(slack * max(longest, TURN_BACK_SECONDS + TURN_SECONDS))
         goals = (Constraint(reach, legs[0], seconds=period, recurrences=3),)
         end = 3 * period
     elif mission_id == "M4":
         # Unbounded: it ends at the episode's horizon, which is therefore the allowed time.
         return Mission((Constraint(ConstraintType.EVENTUALLY, legs[0]), avoid_centre), "M4"), allowed
     else:
-        gap = _halves(slack * max(way.longest_leg_seconds for way in ways))
+        gap = half_seconds(slack * max(max(way.leg_seconds) for way in ways))
         goals = (
             Constraint(ConstraintType.EVENTUALLY, legs[0], different=3, max_gap_seconds=gap),
             Constraint(ConstraintType.EVENTUALLY, legs[1], max_gap_seconds=gap),
             avoid_centre,
         )
         end = 4 * gap
-    return Mission(goals, mission_id), _halves(end + PURSUIT_SECONDS)
+    return Mission(goals, mission_id), half_seconds(end + PURSUIT_SECONDS)
 
 
 @lru_cache(maxsize=1024)
@@ -355,7 +360,7 @@ def ego_can_be_first(task: Task) -> bool:
         return False
     scenario = task.scenario
     grid = GridMap.from_scenario(scenario, PLANNING_CELL_METRES)
-    travel = _Travel(scenario, grid, avoid_centre=task.mission_id in ("M4", "M5"))
+    travel = Travel(scenario, grid, _avoided(scenario, task.mission_id))
     ways = travel.ways(scenario.adversary_start.centre, [g.places for g in goals], task.mission_id)
     shortest = min(way.seconds for way in ways) - 3 * TURN_SECONDS - START_RADIUS_METRES / scenario.adversary.max_speed
     place = scenario.place(goals[-1].places[0])

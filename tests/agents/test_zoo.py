@@ -26,6 +26,7 @@ from tab_marl.agents.zoo import (
     load_zoo,
     save_policy,
 )
+from tab_marl.envs.adversary_kernels import O_LIMIT
 from tab_marl.envs.adversary_observation import LAYOUT_VERSION, OBSERVED, observation_bounds
 from tab_marl.world.scenario import UnknownName
 
@@ -108,6 +109,7 @@ def test_acting_leaves_the_observation_and_the_weights_alone(zoo):
 def test_noise_has_the_spread_of_training(zoo):
     policy = next(policy for policy in zoo if policy.log_std is not None)
     seen = np.zeros((4000, OBSERVED), dtype=np.float32)
+    seen[:, O_LIMIT] = 1.0
     mean = policy.act(seen)[0]
     noisy = policy.act(seen, np.random.default_rng(0))
     inside = np.abs(mean) < 0.5
@@ -136,6 +138,7 @@ def test_the_exported_actor_equals_stable_baselines3s(model, tmp_path):
     folder = export_policy(model, settings, tmp_path)
     policy = load_policy(folder)
     seen = observations(50)
+    seen[:, O_LIMIT] = 1.0
     theirs, _ = model.predict(seen, deterministic=True)
     np.testing.assert_allclose(policy.act(seen), theirs, atol=1e-5)
     assert policy.style == settings.style and policy.card.network.layers == (OBSERVED, 24, 12, 2)

@@ -20,6 +20,7 @@ from tab_marl.agents.opponents import load_model
 from tab_marl.agents.sb3_actors import actor_of_model, normalised, read_zip
 from tab_marl.agents.training_settings import TrainingSettings
 from tab_marl.agents.zoo import PolicyError, load_policy, policy_of, save_policy
+from tab_marl.envs.adversary_kernels import O_LIMIT
 from tab_marl.envs.adversary_observation import OBSERVED, observation_bounds
 from tab_marl.envs.batched_env import batched_adversary_env, batched_ego_env
 from tab_marl.envs.single_agent import adversary_env
@@ -58,7 +59,9 @@ def model(name: str) -> Any:
 
 def observations(*shape: int) -> np.ndarray:
     low, high = (np.clip(bound, -2.0, 2.0) for bound in observation_bounds())
-    return np.random.default_rng(0).uniform(low, high, (*shape, OBSERVED)).astype(np.float32)
+    seen = np.random.default_rng(0).uniform(low, high, (*shape, OBSERVED)).astype(np.float32)
+    seen[..., O_LIMIT] = 1.0
+    return seen
 
 
 def settings(name: str) -> TrainingSettings:
@@ -101,6 +104,18 @@ def test_a_zip_tells_which_algorithm_it_is(tmp_path: Path) -> None:
     for name in ("ppo", "a2c", "sac", "td3", "tqc", "ppo_lstm"):
         model(name).save(tmp_path / f"{name}.zip")
         assert read_zip(tmp_path / f"{name}.zip").algorithm == MODELS[name][0].__name__
+
+
+def test_a_governor_keeps_the_missions_speed_limit_and_nothing_else() -> None:
+    policy = policy_of(model("sac"), settings("x"), 0)
+    seen = observations(50)
+    free = policy.act(seen)
+    for limit in (0.3, 0.8):
+        seen[:, O_LIMIT] = limit
+        network, action = policy.actor(seen, Memory()), policy.act(seen)
+        np.testing.assert_array_equal(action[:, 1], network[:, 1])
+        np.testing.assert_allclose(action[:, 0], np.minimum(network[:, 0], 2 * limit - 1), atol=1e-6)
+        assert (action[:, 0] < free[:, 0]).any()
 
 
 def test_a_recurrent_policy_remembers_its_episode_and_nothing_of_the_last_one() -> None:
@@ -146,6 +161,7 @@ def test_a_vectorised_normalisation_is_part_of_the_actor() -> None:
 
     venv = VecNormalize(DummyVecEnv([adversary_env]), clip_obs=1.5)
     seen = observations(200) * 3
+    seen[:, O_LIMIT] = np.linspace(-1.0, 1.0, 200)
     venv.obs_rms.update(seen)
     actor, _ = actor_of_model(model("ppo"))
     behind = normalised(actor, venv.obs_rms.mean, venv.obs_rms.var, venv.clip_obs, venv.epsilon)
