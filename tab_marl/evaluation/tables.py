@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import itertools
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 
-from tab_marl.evaluation import statistics
-from tab_marl.evaluation.rows import EpisodeRow, Timing, scored_completed, scored_steps
-from tab_marl.evaluation.settings import FAMILIES, HEADLINE, MISSIONS, PAPER_PLANNERS, PLANNERS
-from tab_marl.evaluation.statistics import Interval, Paired
+from tab_marl.evaluation.rows import EpisodeRow, Timing
+from tab_marl.evaluation.settings import FAMILIES, MISSIONS, PAPER_PLANNERS, PLANNERS
+from tab_marl.evaluation.statistics import Interval, Paired, bootstrap_mean, frame, share
+from tab_marl.evaluation.statistics.frames import ALL, cells, order, paired, slack_bin
 
-ALL = "all"
-"""In place of a mission: the mean over the missions, each with equal weight."""
+__all__ = ["ALL", "Line", "Pace", "Share", "by_part", "lines", "order", "paces", "paces_by_mission", "slack_bin"]
 
-SLACK_EDGES = (1.3, 1.6, 2.0)
-"""Bounds between the bins of the table by slack."""
+Rows = Sequence[EpisodeRow] | pd.DataFrame
 
 
 @dataclass(frozen=True)
@@ -46,12 +44,13 @@ class Line:
 
 @dataclass(frozen=True)
 class Share:
-    """ATCR of one planner on a part of the episodes (an adversary, a bin of slack)."""
+    """ATCR and StI of one planner on a part of the episodes (an adversary, a bin of slack)."""
 
     family: str
     part: str
     planner: str
     atcr: Interval
+    steps: Interval
 
 
 @dataclass(frozen=True)
@@ -68,104 +67,73 @@ class Pace:
     """Mean over that of S-POMCP."""
 
 
-def order(names: Iterable[str], known: Sequence[str]) -> list[str]:
-    """Each once, in the order of `known`, strangers last by name."""
-    return sorted(set(names), key=lambda n: (known.index(n) if n in known else len(known), n))
+def scored(rows: Rows) -> pd.DataFrame:
+    """The rows as `statistics.frame` makes them, unless they are that already."""
+    return rows if isinstance(rows, pd.DataFrame) and "lost" in rows else frame(rows)
 
 
-def lines(rows: Sequence[EpisodeRow]) -> list[Line]:
+def lines(rows: Rows) -> list[Line]:
     """Every (family, mission, planner) with rows, then every (family, ALL, planner) where there are several missions."""
-    cells: dict[tuple[str, str, str], list[EpisodeRow]] = defaultdict(list)
-    for row in rows:
-        cells[row.family, row.mission, row.planner].append(row)
-    found = []
-    for family in order((r.family for r in rows), FAMILIES):
-        missions = order((r.mission for r in rows if r.family == family), MISSIONS)
-        for mission in missions + ([ALL] if len(missions) > 1 else []):
-            members = missions if mission == ALL else [mission]
-            part = {
-                planner: [row for m in members for row in cells.get((family, m, planner), ())]
-                for planner in order((r.planner for r in rows), PLANNERS)
-            }
-            found += [_line(family, mission, p, part[p], part.get(HEADLINE, [])) for p in part if part[p]]
-    return found
+    table = scored(rows)
+    against = paired(table)
+    return [
+        _line(family, mission, planner, part, against)
+        for family, mission, parts in cells(table)
+        for planner, part in parts.items()
+    ]
 
 
-def _line(family: str, mission: str, planner: str, rows: list[EpisodeRow], headline: list[EpisodeRow]) -> Line:
-    strata = [r.mission for r in rows]
-    caught = [r.physics_steps for r in rows if r.intercepted and r.error is None]
-    atcr_pair = steps_pair = None
-    if planner != HEADLINE:
-        other = {(r.mission, r.seed): r for r in headline}
-        both = [(r, other[r.mission, r.seed]) for r in rows if (r.mission, r.seed) in other]
-        if both:
-            mine, theirs = zip(*both, strict=True)
-            where = [r.mission for r in mine]
-            atcr_pair = statistics.paired_shares(
-                [scored_completed(r) for r in mine], [scored_completed(r) for r in theirs], where
-            )
-            steps_pair = statistics.paired_steps(
-                [scored_steps(r) for r in mine], [scored_steps(r) for r in theirs], where
-            )
+def _line(
+    family: str,
+    mission: str,
+    planner: str,
+    part: pd.DataFrame,
+    against: Mapping[tuple[str, str, str, str], Paired],
+) -> Line:
+    strata = part["mission"].tolist()
+    caught = part.loc[part["met"] == 1, "sti"]
     return Line(
         family=family,
         mission=mission,
         planner=planner,
-        episodes=len(rows),
-        errors=sum(r.error is not None for r in rows),
-        atcr=statistics.share([scored_completed(r) for r in rows], strata),
-        steps=statistics.bootstrap_mean([scored_steps(r) for r in rows], strata),
-        steps_if_intercepted=float(np.mean(caught)) if caught else None,
-        intercepted=float(np.mean([r.intercepted for r in rows])),
-        mission_failed=float(np.mean([r.failed for r in rows])),
-        fallbacks_per_episode=float(np.mean([r.fallbacks for r in rows])),
-        atcr_against_headline=atcr_pair,
-        steps_against_headline=steps_pair,
+        episodes=len(part),
+        errors=int(part["broken"].sum()),
+        atcr=share(part["lost"], strata),
+        steps=bootstrap_mean(part["sti"], strata),
+        steps_if_intercepted=float(caught.mean()) if len(caught) else None,
+        intercepted=float(part["intercepted"].mean()),
+        mission_failed=float(part["failed"].mean()),
+        fallbacks_per_episode=float(part["fallbacks"].mean()) if "fallbacks" in part else 0.0,
+        atcr_against_headline=against.get((family, mission, planner, "ATCR")),
+        steps_against_headline=against.get((family, mission, planner, "StI")),
     )
 
 
-def by_part(rows: Sequence[EpisodeRow], part: Callable[[EpisodeRow], str | None]) -> list[Share]:
-    """ATCR per family, part and planner, all missions together; rows whose part is None are left out."""
-    cells: dict[tuple[str, str, str], list[EpisodeRow]] = defaultdict(list)
-    for row in rows:
-        name = part(row)
-        if name is not None:
-            cells[row.family, name, row.planner].append(row)
-    parts = sorted({p for _, p, _ in cells})
-    return [
-        Share(f, p, planner, statistics.share([scored_completed(r) for r in cells[f, p, planner]]))
-        for f in order((r.family for r in rows), FAMILIES)
-        for p in parts
-        for planner in order((r.planner for r in rows), PLANNERS)
-        if (f, p, planner) in cells
-    ]
+def by_part(rows: Rows, column: str) -> list[Share]:
+    """ATCR and StI per family, part and planner, all missions together; rows whose part is missing are left out.
+
+    `column`: "adversary", "slack_bin", "style", "split" or any other of the rows.
+    """
+    table = scored(rows)
+    found = []
+    for family in order(table["family"], FAMILIES):
+        kept = table[(table["family"] == family) & table[column].notna() & (table[column].astype(str) != "")]
+        groups = dict(list(kept.groupby([column, "planner"])))
+        for part in order(kept[column].astype(str), MISSIONS):
+            for planner in order(kept["planner"], PLANNERS):
+                if (part, planner) in groups:
+                    rows_of = groups[part, planner]
+                    found.append(Share(family, part, planner, share(rows_of["lost"]), bootstrap_mean(rows_of["sti"])))
+    return found
 
 
-def by_adversary(rows: Sequence[EpisodeRow]) -> list[Share]:
-    return by_part(rows, lambda r: r.adversary or None)
-
-
-def by_slack(rows: Sequence[EpisodeRow]) -> list[Share]:
-    return by_part(rows, lambda r: slack_bin(r.slack))
-
-
-def where_ego_is_first(rows: Sequence[EpisodeRow]) -> list[Share]:
+def where_ego_is_first(rows: Rows) -> list[Share]:
     """The sanity bar: episodes in which the ego could simply go to the only goal and wait."""
-    return by_part(rows, lambda r: "ego can be first" if r.ego_first else None)
+    table = scored(rows)
+    return by_part(table[table["ego_first"]].assign(part="ego can be first"), "part")
 
 
-def slack_bin(slack: float) -> str | None:
-    """Text of the bin a slack falls in; None without a slack."""
-    if not np.isfinite(slack):
-        return None
-    edges = (1.0, *SLACK_EDGES)
-    for low, high in itertools.pairwise(edges):
-        if slack < high:
-            return f"{low:g} to {high:g}"
-    return f"{edges[-1]:g} or more"
-
-
-def paces(timings: dict[tuple[str, str, str, int], Timing]) -> list[Pace]:
+def paces(timings: Mapping[tuple[str, str, str, int], Timing]) -> list[Pace]:
     """Decision times per planner, planners in the usual order."""
     groups: dict[str, list[Timing]] = defaultdict(list)
     for (_, _, planner, _), timing in timings.items():
@@ -187,3 +155,9 @@ def paces(timings: dict[tuple[str, str, str, int], Timing]) -> list[Pace]:
         )
         for planner in order(groups, PLANNERS)
     ]
+
+
+def paces_by_mission(timings: Mapping[tuple[str, str, str, int], Timing]) -> dict[str, list[Pace]]:
+    """`paces` of each mission alone."""
+    missions = order([key[0] for key in timings], MISSIONS)
+    return {m: paces({key: t for key, t in timings.items() if key[0] == m}) for m in missions}

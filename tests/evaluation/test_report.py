@@ -98,8 +98,13 @@ def test_report_that_cannot_be_written(data, tmp_path):
 
 def test_every_plot_is_xml_and_keeps_inside_its_box():
     dots = [charts.Dot(p, Interval(0.2, 0.1, 0.9, 50), 13.3) for p in settings.PLANNERS]
-    curves = {p: np.linspace(0, 0.3 + 0.1 * i, 10) for i, p in enumerate(settings.PLANNERS)}
-    for svg in (charts.interval_plot(dots, 100, "u", 'a "title" & more', 100), charts.curve_plot(curves, "t")):
+    x = np.linspace(0, 50, 10)
+    tracks = [charts.Track(p, x, x / 100 + 0.1 * i, x / 100, np.full(10, 1.2)) for i, p in enumerate(settings.PLANNERS)]
+    plots = (
+        charts.interval_plot(dots, 100, "u", 'a "title" & more', 100),
+        charts.curve_plot(tracks, "t", "seconds", (0.0, 50.0)),
+    )
+    for svg in plots:
         tree = ET.fromstring(svg)
         _, _, width, height = (float(v) for v in tree.get("viewBox").split())
         for node in tree.iter():

@@ -1,12 +1,16 @@
 """Intervals against SciPy's own bootstrap, coverage by simulation, tests against hand-made tables."""
 
+import dataclasses
+import itertools
 import math
 
 import numpy as np
 import pytest
 from scipy import stats
+from statsmodels.stats.multitest import multipletests
 
 from tab_marl.evaluation import statistics
+from tab_marl.evaluation.statistics import paired
 
 
 def test_bootstrap_agrees_with_scipy():
@@ -49,18 +53,18 @@ def test_no_spread_is_not_certainty():
 def test_paired_shares_is_mcnemar_on_the_pairs_that_differ():
     first = [1] * 9 + [0] * 1 + [1] * 40 + [0] * 50
     second = [0] * 9 + [1] * 1 + [1] * 40 + [0] * 50
-    paired = statistics.paired_shares(first, second)
-    assert paired.difference.value == pytest.approx(0.08)
+    found = statistics.paired_shares(first, second)
+    assert found.difference.value == pytest.approx(0.08)
     # Two-sided by hand: 2 * P(at least 9 of 10 heads).
-    assert paired.p_value == pytest.approx(2 * (10 + 1) / 2**10)
-    assert paired.verdict == 1
+    assert found.p_value == pytest.approx(2 * (10 + 1) / 2**10)
+    assert found.verdict == 1
     assert statistics.paired_shares(second, first).verdict == -1
 
 
 def test_four_pairs_are_no_verdict():
-    paired = statistics.paired_shares([1] * 4, [0] * 4)
-    assert paired.difference.low > 0 and paired.p_value == pytest.approx(0.125)
-    assert paired.verdict == 0
+    found = statistics.paired_shares([1] * 4, [0] * 4)
+    assert found.difference.low > 0 and found.p_value == pytest.approx(0.125)
+    assert found.verdict == 0
 
 
 def test_paired_shares_without_a_difference():
@@ -73,8 +77,8 @@ def test_pairing_matters():
     rng = np.random.default_rng(4)
     hard = rng.normal(0, 500, size=100)
     first, second = 1000 + hard, 1000 + hard - 30 + rng.normal(0, 20, size=100)
-    paired = statistics.paired_steps(first, second)
-    assert paired.verdict == 1 and paired.p_value < 1e-6
+    found = statistics.paired_steps(first, second)
+    assert found.verdict == 1 and found.p_value < 1e-6
     unpaired = stats.mannwhitneyu(first, second).pvalue
     assert unpaired > 0.05
 
@@ -90,9 +94,49 @@ def test_unequal_lengths_are_refused():
         statistics.bootstrap_mean([])
 
 
-def test_cumulative_share_counts_by_hand():
-    curve = statistics.cumulative_share([10, 20, 30, 99], [True, True, True, False], [0, 10, 25, 100])
-    assert curve.tolist() == [0, 0.25, 0.5, 0.75]
+def brute_signed_rank(d):
+    """Every assignment of signs to the ranks of what differs, counted."""
+    d = np.asarray(d, dtype=float)
+    ranks = stats.rankdata(np.abs(d))[d != 0]
+    seen = stats.rankdata(np.abs(d))[d > 0].sum()
+    sums = np.array([np.dot(signs, ranks) for signs in itertools.product((0, 1), repeat=len(ranks))])
+    centre = ranks.sum() / 2
+    return np.mean(np.abs(sums - centre) >= abs(seen - centre) - 1e-9)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_signed_rank_counts_every_sign(seed):
+    rng = np.random.default_rng(seed)
+    tied = rng.integers(-4, 6, size=11)  # ties and zeros in plenty
+    assert statistics.signed_rank_p(tied) == pytest.approx(brute_signed_rank(tied), rel=1e-12)
+
+
+def test_signed_rank_is_scipys_where_scipy_is_exact():
+    d = np.random.default_rng(0).normal(0.2, 1, size=40)
+    assert statistics.signed_rank_p(d) == pytest.approx(stats.wilcoxon(d, method="exact").pvalue, rel=1e-9)
+
+
+def test_signed_rank_of_many_pairs_meets_the_exact_one(monkeypatch):
+    d = np.rint(np.random.default_rng(1).normal(0.25, 3, size=300))
+    exact = statistics.signed_rank_p(d)
+    monkeypatch.setattr(paired, "EXACT_PAIRS", 10)
+    assert statistics.signed_rank_p(d) == pytest.approx(exact, rel=0.03)
+    assert exact == pytest.approx(stats.wilcoxon(d, zero_method="pratt", method="approx").pvalue, rel=0.03)
+
+
+def test_holm_is_statsmodels():
+    rng = np.random.default_rng(2)
+    p = np.concatenate([rng.random(9) ** 4, [0.01, 0.01]])
+    ours = statistics.holm(dict(enumerate(p)))
+    theirs = multipletests(p, method="holm")[1]
+    assert [ours[k] for k in range(len(p))] == pytest.approx(theirs.tolist())
+    assert statistics.holm({}) == {}
+
+
+def test_correction_can_take_a_verdict_away():
+    alone = statistics.paired_shares([1] * 9 + [0] * 41, [0] * 50)
+    assert alone.verdict == 1
+    assert dataclasses.replace(alone, adjusted=0.06, comparisons=15).verdict == 0
 
 
 def test_same_input_same_figures():

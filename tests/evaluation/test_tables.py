@@ -54,12 +54,12 @@ def test_all_missions_weigh_equally(synthetic):
 
 def test_parts(synthetic):
     rows = [synthetic.row(seed=s, slack=x, ego_first=s == 0, adversary=a) for s, (x, a) in enumerate([(1.25, "x"), (1.3, "y"), (2.4, "x"), (math.nan, "")])]  # fmt: skip
-    assert [(s.part, s.atcr.count) for s in tables.by_slack(rows)] == [
+    assert [(s.part, s.atcr.count) for s in tables.by_part(rows, "slack_bin")] == [
         ("1 to 1.3", 1),
         ("1.3 to 1.6", 1),
         ("2 or more", 1),
     ]
-    assert [(s.part, s.atcr.count) for s in tables.by_adversary(rows)] == [("x", 2), ("y", 1)]
+    assert [(s.part, s.atcr.count) for s in tables.by_part(rows, "adversary")] == [("x", 2), ("y", 1)]
     assert [s.atcr.count for s in tables.where_ego_is_first(rows)] == [1]
 
 

@@ -35,7 +35,9 @@ class Dot:
     """The paper's figure, drawn as a hollow diamond."""
 
 
-def interval_plot(dots: Sequence[Dot], maximum: float, unit: str, title: str, scale: float = 1.0) -> str:
+def interval_plot(
+    dots: Sequence[Dot], maximum: float, unit: str, title: str, scale: float = 1.0, digits: int = 1
+) -> str:
     """Dots with 95 % intervals, one row per planner. `scale` turns the interval's numbers into the axis' ones."""
     height = TOP + ROW * len(dots) + FOOT
     span = WIDTH - LABELS - RIGHT
@@ -54,13 +56,15 @@ def interval_plot(dots: Sequence[Dot], maximum: float, unit: str, title: str, sc
     for i, dot in enumerate(dots):
         y = TOP + ROW * (i + 0.5)
         low, value, high = (scale * v for v in (dot.interval.low, dot.interval.value, dot.interval.high))
-        note = f"{dot.planner}: {value:.1f} (95 % {low:.1f} to {high:.1f}), n = {dot.interval.count}"
+        note = (
+            f"{dot.planner}: {value:.{digits}f} (95 % {low:.{digits}f} to {high:.{digits}f}), n = {dot.interval.count}"
+        )
         if dot.paper is not None:
             note += f"; paper {dot.paper:g}"
         parts.append(
             f'<g class="{css_name(dot.planner)}"><title>{escape(note)}</title>'
             f'<rect class="hit" x="0" y="{y - ROW / 2:.1f}" width="{WIDTH}" height="{ROW}"/>'
-            f'<text class="name" x="{LABELS - 8}" y="{y + 4:.1f}" text-anchor="end">{escape(_short(dot.planner))}</text>'
+            f'<text class="name" x="{LABELS - 8}" y="{y + 4:.1f}" text-anchor="end">{escape(short(dot.planner))}</text>'
             f'<line class="whisker" x1="{x(low):.1f}" x2="{max(x(high), x(low) + 0.5):.1f}" y1="{y:.1f}" y2="{y:.1f}"/>'
             f"{mark(dot.planner, x(value), y)}"
         )
@@ -94,11 +98,31 @@ def legend_mark(planner: str) -> str:
     )
 
 
-def curve_plot(curves: Mapping[str, NDArray[np.float64]], title: str) -> str:
-    """Cumulative shares ``[N]`` over N even steps of the episode, one line per planner, named at its end."""
-    width, height, left, top, foot = 430, 250, 34, 10, 34
-    right = 96
+@dataclass(frozen=True)
+class Track:
+    """One planner's line: values ``[N]`` (shares) over x ``[N]``, with a band where one is drawn."""
+
+    planner: str
+    x: NDArray[np.float64]
+    value: NDArray[np.float64]
+    low: NDArray[np.float64] | None = None
+    high: NDArray[np.float64] | None = None
+
+
+def curve_plot(
+    tracks: Sequence[Track], title: str, x_label: str, x_range: tuple[float, float], x_ticks: Sequence[float] = ()
+) -> str:
+    """Shares over x, one line per planner, named at its end; bands as pale areas."""
+    width, height, left, top, foot, right = 430, 250, 34, 10, 34, 78
     w, h = width - left - right, height - top - foot
+    start, end = x_range
+
+    def across(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        return left + w * np.clip((x - start) / (end - start), 0, 1)
+
+    def down(share: NDArray[np.float64]) -> NDArray[np.float64]:
+        return top + h * (1 - np.clip(share, 0, 1))
+
     parts = [_open(width, height, title)]
     for share in (0.0, 0.25, 0.5, 0.75, 1.0):
         y = top + h * (1 - share)
@@ -106,24 +130,37 @@ def curve_plot(curves: Mapping[str, NDArray[np.float64]], title: str) -> str:
             f'<line class="grid" x1="{left}" x2="{left + w}" y1="{y:.1f}" y2="{y:.1f}"/>'
             f'<text class="tick" x="{left - 5}" y="{y + 4:.1f}" text-anchor="end">{100 * share:.0f}</text>'
         )
+    for tick in x_ticks or ticks(end):
+        x = left + w * (tick - start) / (end - start)
+        parts.append(f'<text class="tick" x="{x:.1f}" y="{top + h + 15}" text-anchor="middle">{tick:g}</text>')
+    parts.append(f'<text class="axis" x="{left + w / 2:.0f}" y="{height - 4}" text-anchor="middle">{x_label}</text>')
+    for track in tracks:
+        if track.low is not None and track.high is not None:
+            x = across(np.concatenate([track.x, track.x[::-1]]))
+            y = down(np.concatenate([track.high, track.low[::-1]]))
+            parts.append(f'<g class="{css_name(track.planner)}"><polygon class="band" points="{_points(x, y)}"/></g>')
+    ends = spread_labels({t.planner: float(down(t.value)[-1]) for t in tracks}, 13, top + 4, top + h)
+    for track in tracks:
+        x, y = across(track.x), down(track.value)
+        note = f"{track.planner}: {100 * track.value[-1]:.1f} % at the end"
+        if track.low is not None and track.high is not None:
+            note += f" (95 % {100 * track.low[-1]:.1f} to {100 * track.high[-1]:.1f})"
         parts.append(
-            f'<text class="tick" x="{left + w * share:.1f}" y="{top + h + 15}" text-anchor="middle">{100 * share:.0f}</text>'
-        )
-    parts.append(
-        f'<text class="axis" x="{left + w / 2:.0f}" y="{height - 4}" text-anchor="middle">% of the episode’s time</text>'
-    )
-    ends = spread_labels({p: top + h * (1 - float(c[-1])) for p, c in curves.items()}, 13, top + 4, top + h)
-    for planner, curve in curves.items():
-        across = left + w * np.linspace(0, 1, len(curve))
-        down = top + h * (1 - curve)
-        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across, down, strict=True))
-        parts.append(
-            f'<g class="{css_name(planner)}"><title>{escape(planner)}: {100 * curve[-1]:.1f} % at the end</title>'
-            f'<polyline class="curve" points="{points}"/>'
-            f'<path class="leader" d="M{left + w} {down[-1]:.1f}L{left + w + 10} {ends[planner]:.1f}"/>'
-            f'<text class="name" x="{left + w + 13}" y="{ends[planner] + 4:.1f}">{escape(_short(planner))}</text></g>'
+            f'<g class="{css_name(track.planner)}"><title>{escape(note)}</title>'
+            f'<polyline class="curve" points="{_points(x, y)}"/>'
+            f'<path class="leader" d="M{left + w} {y[-1]:.1f}L{left + w + 9} {ends[track.planner]:.1f}"/>'
+            f'<text class="name" x="{left + w + 12}" y="{ends[track.planner] + 4:.1f}">{escape(short(track.planner))}</text></g>'
         )
     return "".join(parts) + "</svg>"
+
+
+def _points(x: NDArray[np.float64], y: NDArray[np.float64]) -> str:
+    """Points of a line in pixels, without those that lie on a straight level between their neighbours."""
+    keep = np.ones(len(x), dtype=bool)
+    if len(x) > 2:
+        level = (np.abs(np.diff(y)) < 0.05)  # fmt: skip
+        keep[1:-1] = ~(level[:-1] & level[1:])
+    return " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x[keep], y[keep], strict=True))
 
 
 def spread_labels(wanted: Mapping[str, float], gap: float, low: float, high: float) -> dict[str, float]:
@@ -146,7 +183,8 @@ def ticks(maximum: float) -> list[float]:
     return [float(v) for v in np.arange(0, maximum + step * 1e-6, step)]
 
 
-def _short(planner: str) -> str:
+def short(planner: str) -> str:
+    """A planner's name as charts write it."""
     return planner.removesuffix("-POMCP")
 
 

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from tab_marl.evaluation import statistics, tables
 from tab_marl.evaluation.errors import UserError
-from tab_marl.evaluation.report import charts
+from tab_marl.evaluation.report import charts, numbers, panels
 from tab_marl.evaluation.report.findings import findings
+from tab_marl.evaluation.report.numbers import Shown
 from tab_marl.evaluation.report.paper import MISSION_TEXT, PAPER, TAB_TIME_RATIO
-from tab_marl.evaluation.rows import EpisodeRow, Timing, scored_completed
-from tab_marl.evaluation.settings import HEADLINE, PLANNERS
-from tab_marl.evaluation.statistics import Interval, Paired
-from tab_marl.evaluation.tables import ALL, Line, Share
+from tab_marl.evaluation.report.results import ReportData, Results, compute
+from tab_marl.evaluation.settings import HEADLINE, MISSIONS, PAPER_PLANNERS, PLANNERS
+from tab_marl.evaluation.tables import ALL, Line
+
+__all__ = ["ReportData", "render", "write_report"]
 
 MODELS = {
     "S-POMCP": "moves at random, as far as its motors allow",
@@ -42,30 +42,21 @@ FAMILY_TEXT = {
     "ambiguous": "The goal is any of several. Waiting at one of them may be in vain: here prediction decides.",
 }
 
-CURVE_POINTS = 121
+
+PART_TEXT = {
+    "adversary": "Which opponents are hard, and for whom. They take turns over the seeds, so each planner met each of them "
+    "on the same episodes.",
+    "style": "The habits that opponents were trained with.",
+    "split": "Opponents that planners and settings were developed with, and those kept for the final measurement.",
+    "slack_bin": "Slack is the time allowed over the shortest time in which the mission can be done. With little of it every "
+    "way is nearly the shortest one; with much of it the adversary has a choice.",
+}
+PART_NAME = {"adversary": "Adversary", "style": "Style", "split": "Split", "slack_bin": "Slack"}
 
 
-@dataclass(frozen=True)
-class ReportData:
-    """Everything the page is made of."""
-
-    rows: Sequence[EpisodeRow]
-    timings: Mapping[tuple[str, str, str, int], Timing]
-    content: Mapping[str, Any]
-    """The settings that decide the rows."""
-    key: str
-    replays: Sequence[Mapping[str, Any]] = ()
-    """As `replaying.replay_groups` makes them."""
-    figures: Mapping[str, str] | None = None
-    """SVG by name, as `figures.explanation` makes them; None leaves the drawn explanation out."""
-    cards: Sequence[Mapping[str, str]] = ()
-    """Adversaries: name, text."""
-    version: str = ""
-
-
-def write_report(data: ReportData, path: Path) -> None:
+def write_report(data: ReportData, path: Path, results: Results | None = None) -> None:
     """Write the page. Raises UserError if the file cannot be written."""
-    text = render(data)
+    text = render(data, results)
     partial = path.with_suffix(".part")
     try:
         partial.write_text(text, encoding="utf-8")
@@ -75,35 +66,40 @@ def write_report(data: ReportData, path: Path) -> None:
         raise UserError(f"{path}: the report cannot be written: {error.strerror}; the episodes are safe") from None
 
 
-def render(data: ReportData) -> str:
-    """The page as text."""
+def render(data: ReportData, results: Results | None = None) -> str:
+    """The page as text; `results` where they are computed already."""
+    found = compute(data) if results is None else results
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {
-        "percent": _percent,
-        "steps": _steps,
-        "points": _points,
-        "plain_steps": _step_difference,
+        "percent": lambda x: _shown(numbers.percent(x)),
+        "steps": lambda x: _shown(numbers.steps(x)),
+        "points": lambda x: _difference(numbers.difference(x, 100.0)),
+        "plain_steps": lambda x: _difference(numbers.difference(x)),
         "p": statistics.stars,
+        "short": charts.short,
+        "css_name": charts.css_name,
     }
-    found = tables.lines(data.rows)
-    families = list(dict.fromkeys(line.family for line in found))
-    planners = tables.order((r.planner for r in data.rows), PLANNERS)
-    errors = [r for r in data.rows if r.error is not None]
-    traces = {t for r in errors if (t := data.timings[r.key].traceback if r.key in data.timings else None)}
+    families = list(dict.fromkeys(line.family for line in found.lines))
+    planners = tables.order(found.table["planner"], PLANNERS)
+    broken = found.table[found.table["broken"]]
+    errors = broken[["mission", "family", "planner", "seed", "error"]].to_dict("records")
+    keys = [(r["mission"], r["family"], r["planner"], r["seed"]) for r in errors]
+    traces = {t for key in keys if (t := data.timings[key].traceback if key in data.timings else None)}
     return environment.from_string(_template("report.html.j2")).render(
         css=Markup(_template("report.css")),
         script=Markup(_template("report.js")),
-        findings=findings(found),
-        lines=found,
-        families=[
-            {"name": f, "text": FAMILY_TEXT.get(f, ""), "lines": [x for x in found if x.family == f]} for f in families
+        findings=findings(found.lines),
+        lines=found.lines,
+        families=[_family(name, found) for name in families],
+        beside=_beside(found.lines),
+        parts=[
+            {"name": PART_NAME[c], "text": PART_TEXT[c], "grids": panels.heat_map(shares)}
+            for c, shares in found.by.items()
         ],
-        panels={f: _panels([x for x in found if x.family == f], f) for f in families},
-        curves={f: _curves([r for r in data.rows if r.family == f]) for f in families},
-        adversaries=_grid(tables.by_adversary(data.rows)),
-        slacks=_grid(tables.by_slack(data.rows)),
-        first=_grid(tables.where_ego_is_first(data.rows)),
+        first=panels.heat_map(found.first),
         paces=tables.paces(dict(data.timings)),
+        mission_paces=_mission_paces(data),
+        pace_plot=panels.pace_plot(data.timings),
         paper=PAPER,
         paper_ratio=TAB_TIME_RATIO,
         mission_text=MISSION_TEXT,
@@ -115,12 +111,13 @@ def render(data: ReportData) -> str:
         cards=data.cards,
         errors=errors,
         tracebacks=sorted(traces)[:5],
-        content=json.dumps(dict(data.content), indent=2),
+        content=json.dumps(dict(data.content), indent=2, default=str),
+        record=_record(data.record),
         key=data.key,
         version=data.version,
-        episodes=len(data.rows),
+        episodes=len(found.table),
         all=ALL,
-        any_exact=any(x.atcr.exact for x in found),
+        any_exact=any(x.atcr.exact for x in found.lines),
     )
 
 
@@ -134,94 +131,78 @@ def _template(name: str) -> str:
     return resources.files("tab_marl.evaluation.report").joinpath("templates", name).read_text(encoding="utf-8")
 
 
-def _panels(found: Sequence[Line], family: str) -> list[dict[str, Any]]:
-    """Per mission: the interval plots of ATCR and StI."""
-    top = max((x.steps.high for x in found), default=1.0)
-    if family == "point":
-        top = max(
-            [top] + [f.steps for (m, p), f in PAPER.items() if any(x.mission == m and x.planner == p for x in found)]
-        )
-    panels = []
-    for mission in dict.fromkeys(x.mission for x in found):
-        part = [x for x in found if x.mission == mission]
-        figures = {x.planner: PAPER.get((mission, x.planner)) if family == "point" else None for x in part}
-        name = "all missions" if mission == ALL else mission
-        completion = [
-            charts.Dot(x.planner, x.atcr, f.atcr_percent if (f := figures[x.planner]) else None) for x in part
-        ]
-        meeting = [charts.Dot(x.planner, x.steps, f.steps if (f := figures[x.planner]) else None) for x in part]
-        panels.append(
-            {
-                "mission": name,
-                "atcr": Markup(charts.interval_plot(completion, 100, "ATCR, % (lower is better)", f"ATCR, {name}, {family}", 100)),
-                "sti": Markup(charts.interval_plot(meeting, top * 1.02, "StI, physics steps (lower is better)", f"StI, {name}, {family}")),
-            }
-        )  # fmt: skip
-    return panels
-
-
-def _curves(rows: Sequence[EpisodeRow]) -> dict[str, Markup]:
-    grid = np.linspace(0, 1, CURVE_POINTS)
-    met, done = {}, {}
-    for planner in tables.order((r.planner for r in rows), PLANNERS):
-        part = [r for r in rows if r.planner == planner]
-        met[planner] = statistics.cumulative_share(
-            [r.physics_steps / r.horizon_steps for r in part], [r.intercepted and r.error is None for r in part], grid
-        )
-        done[planner] = statistics.cumulative_share(
-            [(r.completed_step if r.completed_step is not None else r.horizon_steps) / r.horizon_steps for r in part],
-            [scored_completed(r) for r in part],
-            grid,
-        )
+def _family(name: str, found: Results) -> dict[str, Any]:
+    """Everything that is shown of one family of scenarios."""
+    lines = [x for x in found.lines if x.family == name]
+    middles = found.aggregates[found.aggregates["family"] == name]
+    means = found.restricted[found.restricted["family"] == name]
+    missions = tables.order(means["mission"], MISSIONS)
+    seconds = {(r.mission, r.planner): r for r in means.itertuples()}
     return {
-        "met": Markup(charts.curve_plot(met, "Share of episodes intercepted over time")),
-        "done": Markup(charts.curve_plot(done, "Share of missions completed over time")),
-    }
+        "name": name,
+        "text": FAMILY_TEXT.get(name, ""),
+        "lines": lines,
+        "panels": panels.interval_panels(lines, name),
+        "completed": panels.curve_panels(found.completed, name, "Missions completed before interception"),
+        "met": panels.curve_panels(found.met, name, "Adversaries met"),
+        "profile": panels.profile_plot(found.profiles, name),
+        "middle": panels.middle_plot(found.aggregates, name),
+        "middles": middles.to_dict("records"),
+        "missions": missions,
+        "until": {m: next(r.until_seconds for (k, _), r in seconds.items() if k == m) for m in missions},
+        "seconds": seconds,
+        "planners": tables.order([x.planner for x in lines], PLANNERS),
+        "comparisons": max((x.atcr_against_headline.comparisons for x in lines if x.atcr_against_headline and x.mission != ALL and x.planner in PAPER_PLANNERS), default=0),
+    }  # fmt: skip
 
 
-def _grid(shares: Sequence[Share]) -> list[dict[str, Any]]:
-    """Per family: parts as rows, planners as columns."""
-    grids = []
-    for family in dict.fromkeys(s.family for s in shares):
-        part = [s for s in shares if s.family == family]
-        cells = {(s.part, s.planner): s.atcr for s in part}
-        columns = tables.order((s.planner for s in part), PLANNERS)
-        rows = [
-            {
-                "part": name,
-                "count": max(cells[name, p].count for p in columns if (name, p) in cells),
-                "cells": [cells.get((name, p)) for p in columns],
-            }
-            for name in dict.fromkeys(s.part for s in part)
-        ]
-        grids.append({"family": family, "planners": columns, "rows": rows})
-    return grids
+def _beside(lines: Sequence[Line]) -> list[dict[str, Any]]:
+    """The paper's tables with ours under each figure: a row per mission of `point`, a column per planner of theirs."""
+    ours = {(x.mission, x.planner): x for x in lines if x.family == "point"}
+    missions = [m for m in MISSIONS if any((m, p) in ours for p in PAPER_PLANNERS)]
+    return [
+        {
+            "mission": m,
+            "cells": [{"planner": p, "paper": PAPER[m, p], "ours": ours.get((m, p))} for p in PAPER_PLANNERS],
+        }
+        for m in missions
+    ]
 
 
-def _percent(interval: Interval) -> Markup:
-    mark = "†" if interval.exact else ""
-    return Markup('{:.1f} <span class="ci">[{:.0f}, {:.0f}]{}</span>').format(
-        100 * interval.value, 100 * interval.low, 100 * interval.high, mark
-    )
+def _mission_paces(data: ReportData) -> list[dict[str, Any]]:
+    """Per mission: milliseconds per decision of S-POMCP and TAB-POMCP, and their ratio."""
+    found = []
+    for mission, several in tables.paces_by_mission(data.timings).items():
+        by_name = {pace.planner: pace for pace in several}
+        if HEADLINE in by_name and PAPER_PLANNERS[0] in by_name:
+            found.append({"mission": mission, "base": by_name[PAPER_PLANNERS[0]], "headline": by_name[HEADLINE]})
+    return found
 
 
-def _steps(interval: Interval) -> Markup:
-    return Markup('{:.0f} <span class="ci">[{:.0f}, {:.0f}]</span>').format(interval.value, interval.low, interval.high)
+def _record(record: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Tables (heading, [(name, value)]) of a nested mapping: its own values first, then a table per mapping in it."""
+    plain, nested = [], []
+    for name, value in record.items():
+        title = str(name).replace("_", " ")
+        if isinstance(value, Mapping):
+            nested.append((title, [(str(k), _value_text(v)) for k, v in value.items()]))
+        else:
+            plain.append((title, _value_text(value)))
+    return ([("", plain)] if plain else []) + nested
 
 
-def _points(paired: Paired | None) -> Markup:
-    return _difference(paired, 100.0)
+def _value_text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value, default=str)
 
 
-def _step_difference(paired: Paired | None) -> Markup:
-    return _difference(paired, 1.0)
+def _shown(shown: Shown) -> Markup:
+    return Markup('{} <span class="ci">{}</span>').format(shown.value, shown.interval)
 
 
-def _difference(paired: Paired | None, scale: float) -> Markup:
-    if paired is None:
+def _difference(shown: Shown | None) -> Markup:
+    if shown is None:
         return Markup("")
-    d = paired.difference
-    style = {1: "better", -1: "worse", 0: ""}[paired.verdict]
-    return Markup('<span class="{}">{:+.0f}</span> <span class="ci">[{:+.0f}, {:+.0f}] p {}</span>').format(
-        style, scale * d.value, scale * d.low, scale * d.high, statistics.stars(paired.p_value)
+    style = {1: "better", -1: "worse", 0: ""}[shown.verdict]
+    return Markup('<span class="{}">{}</span> <span class="ci">{} p {}</span>').format(
+        style, shown.value, shown.interval, shown.p
     )

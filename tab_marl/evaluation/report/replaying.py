@@ -10,14 +10,15 @@ import numpy as np
 
 from tab_marl.envs.mission_scene import mission_scene
 from tab_marl.evaluation.episode import Played, play_unit
-from tab_marl.evaluation.report.replay import Choice, encode_map, encode_trace
+from tab_marl.evaluation.report.replay import Choice, encode_image, encode_map, encode_trace, shrink
 from tab_marl.evaluation.rows import EpisodeRow
 from tab_marl.evaluation.runner import pool
 from tab_marl.evaluation.settings import LEARNS_ACROSS_EPISODES
 from tab_marl.evaluation.store import Store
 from tab_marl.evaluation.units import Job, unit_seeds
+from tab_marl.field import FieldOptions, FieldProblem, solve
 from tab_marl.mission import to_english
-from tab_marl.mission.tasks import sample_task
+from tab_marl.mission.tasks import Task, sample_task
 
 
 def replay_groups(
@@ -84,8 +85,29 @@ def _group(choice: Choice, part: Sequence[tuple[Job, Played]], rows: Mapping[Any
         "about": f"“{text}” Adversary: {job.adversary}. Episode {unit.seed}, slack {task.slack:.2f}.",
         "why": f"Chosen as {choice.why}.",
         "map": encode_map(task.scenario, goals, scene.avoided),
+        "field": encode_field(task, job.planner_preset, max(len(e["trace"]["poses"][0]) for e in episodes)),
         "episodes": episodes,
     }
+
+
+def encode_field(task: Task, preset: str, control_steps: int) -> dict[str, Any]:
+    """The TAB-Field of the mission over the steps that are shown: where the adversary may be if nothing is seen of it.
+
+    `rows`, `columns` of a picture, and `frames`: (control step, encoded picture) at each tick.
+    """
+    problem = FieldProblem.from_mission(task.mission, task.scenario, FieldOptions.preset(preset))
+    field, scenario = solve(problem), task.scenario
+    assert problem.grid is not None  # a mission on a map has one
+    per_tick = scenario.step_seconds * scenario.control_hertz
+    frames = []
+    shape = (0, 0)
+    for tick, occupancy in enumerate(field.occupancy):
+        if tick * per_tick > control_steps:
+            break
+        image = shrink(problem.grid.image(occupancy, 0.0), scenario.width_metres, scenario.height_metres)
+        shape = image.shape
+        frames.append([round(tick * per_tick), encode_image(image)])
+    return {"rows": shape[0], "columns": shape[1], "frames": frames}
 
 
 def outcome(row: EpisodeRow) -> str:

@@ -14,13 +14,25 @@
 
   function readPalette() {
     const style = getComputedStyle(root), found = {};
-    for (const name of ["ego", "adversary", "heat", "goal", "camera", "solid", "floor", "ink", "soft", "line", "warn"]) found[name] = style.getPropertyValue("--" + name).trim();
+    for (const name of ["ego", "adversary", "heat", "field", "goal", "camera", "solid", "floor", "ink", "soft", "line", "warn"]) found[name] = style.getPropertyValue("--" + name).trim();
     return found;
   }
-  let palette = readPalette(), group = 0, time = 0, playing = false, speed = 4, last = 0, showBelief = true;
+  let palette = readPalette(), group = 0, time = 0, playing = false, speed = 4, last = 0;
+  const show = { belief: true, field: true, trails: true };
+  const calm = matchMedia("(prefers-reduced-motion: reduce)");
+
+  // One choice of planners for every chart and for the replays.
+  const hidden = new Set();
+  for (const button of document.querySelectorAll("[data-planner]")) button.addEventListener("click", () => {
+    const name = button.dataset.planner;
+    if (!hidden.delete(name)) hidden.add(name);
+    root.dataset.hide = [...hidden].join(" ");
+    for (const same of document.querySelectorAll("[data-planner]")) same.setAttribute("aria-pressed", !hidden.has(same.dataset.planner));
+    draw();
+  });
   const stage = document.getElementById("stage");
   const scrub = document.getElementById("scrub"), clock = document.getElementById("clock"), play = document.getElementById("play");
-  let panels = [];
+  let panels = [], fieldFrames = new Map();
 
   function unpack(text, cells) {
     const raw = atob(text), out = new Uint8Array(cells);
@@ -42,6 +54,7 @@
     document.getElementById("about").textContent = chosen.about;
     document.getElementById("why").textContent = chosen.why;
     stage.replaceChildren();
+    fieldFrames = new Map();
     panels = chosen.episodes.map(episode => {
       const figure = document.createElement("figure"), canvas = document.createElement("canvas"), caption = document.createElement("figcaption");
       canvas.setAttribute("role", "img");
@@ -50,6 +63,7 @@
       name.textContent = episode.planner;
       state.className = "state";
       caption.append(name, state);
+      figure.className = "p-" + episode.planner.toLowerCase().replace("-pomcp", "");
       figure.append(canvas, caption);
       stage.append(figure);
       return { episode, canvas, state, frames: new Map() };
@@ -77,8 +91,9 @@
   }
   function advance(now) {
     if (!playing) return;
-    seek(time + (now - last) / 1000 * speed);
-    last = now;
+    const passed = (now - last) / 1000 * speed;
+    // Whoever asks for less motion sees a picture per half second of the episode, not a glide.
+    if (!calm.matches || passed >= .5) { seek(time + passed); last = now; }
     if (time >= duration()) setPlaying(false); else requestAnimationFrame(advance);
   }
 
@@ -109,6 +124,33 @@
     return panel.frames.get(key);
   }
 
+  // The field of this moment as dots, larger where the adversary is likelier: told from the belief by shape, not hue.
+  function fieldPicture(index, width, height) {
+    const key = [index, width, height, isDark()].join();
+    if (!fieldFrames.has(key)) {
+      if (fieldFrames.size > 24) fieldFrames.clear();
+      const { rows, columns, frames } = groups[group].field, levels = unpack(frames[index][1], rows * columns);
+      const picture = document.createElement("canvas");
+      picture.width = width; picture.height = height;
+      const ctx = picture.getContext("2d"), across = width / columns, down = height / rows;
+      ctx.fillStyle = palette.field;
+      for (let r = 0; r < rows; r++) for (let c = 0; c < columns; c++) {
+        const level = levels[r * columns + c];
+        if (level < 1) continue;
+        ctx.beginPath();
+        ctx.arc((c + .5) * across, (rows - r - .5) * down, Math.min(across, down) * (.08 + .3 * level / 15), 0, 7);
+        ctx.fill();
+      }
+      fieldFrames.set(key, picture);
+    }
+    return fieldFrames.get(key);
+  }
+  const latest = (frames, moment) => {
+    let index = 0;
+    while (index + 1 < frames.length && frames[index + 1][0] <= moment) index++;
+    return index;
+  };
+
   function draw() {
     if (!groups.length) return;
     const map = groups[group].map;
@@ -123,13 +165,20 @@
       ctx.fillStyle = palette.floor;
       ctx.fillRect(0, 0, canvas.width, canvas.height);
       ctx.setTransform(scale * ratio, 0, 0, -scale * ratio, 0, canvas.height);
-      if (showBelief && t.beliefs.length) {
-        let index = 0;
-        while (index + 1 < t.beliefs.length && t.beliefs[index + 1][0] <= step) index++;
+      if (show.belief && t.beliefs.length) {
+        const index = latest(t.beliefs, step);
         ctx.save();
         ctx.scale(1, -1);
         ctx.imageSmoothingEnabled = true;
         ctx.drawImage(beliefPicture(panel, index), 0, -map.height, map.width, map.height);
+        ctx.restore();
+      }
+      const field = groups[group].field;
+      if (show.field && field) {
+        ctx.save();
+        ctx.setTransform(1, 0, 0, 1, 0, 0);
+        ctx.globalAlpha = .75;
+        ctx.drawImage(fieldPicture(latest(field.frames, step), canvas.width, canvas.height), 0, 0);
         ctx.restore();
       }
       ctx.lineWidth = 1.4 * line;
@@ -152,10 +201,13 @@
       for (const [offset, colour, radius] of [[3, palette.adversary, map.radii[1]], [0, palette.ego, map.radii[0]]]) {
         const xs = t.poses[offset], ys = t.poses[offset + 1], turns = t.poses[offset + 2];
         const x = (xs[step] + (xs[next] - xs[step]) * fraction) / 1000, y = (ys[step] + (ys[next] - ys[step]) * fraction) / 1000;
-        ctx.beginPath();
-        for (let i = 0; i <= step; i++) ctx.lineTo(xs[i] / 1000, ys[i] / 1000);
-        ctx.lineTo(x, y);
-        ctx.strokeStyle = colour; ctx.lineWidth = 2 * line; ctx.globalAlpha = .75; ctx.lineJoin = "round"; ctx.stroke(); ctx.globalAlpha = 1;
+        if (show.trails) {
+          ctx.beginPath();
+          for (let i = 0; i <= step; i++) ctx.lineTo(xs[i] / 1000, ys[i] / 1000);
+          ctx.lineTo(x, y);
+          ctx.strokeStyle = colour; ctx.lineWidth = 2 * line; ctx.globalAlpha = .75; ctx.lineJoin = "round"; ctx.stroke(); ctx.globalAlpha = 1;
+        }
+        ctx.strokeStyle = colour;
         if (offset === 0) {
           ctx.beginPath(); ctx.arc(x, y, map.meet, 0, 7);
           ctx.setLineDash([3 * line, 3 * line]); ctx.lineWidth = line; ctx.stroke(); ctx.setLineDash([]);
@@ -196,16 +248,29 @@
   play.addEventListener("click", () => setPlaying(!playing));
   document.getElementById("restart").addEventListener("click", () => seek(0));
   scrub.addEventListener("input", () => { setPlaying(false); seek(scrub.value / 10); });
-  document.getElementById("speed").addEventListener("change", event => { speed = Number(event.target.value); });
-  const belief = document.getElementById("belief");
-  belief.addEventListener("click", () => { showBelief = !showBelief; belief.setAttribute("aria-pressed", showBelief); draw(); });
+  const speeds = document.getElementById("speed");
+  speeds.addEventListener("change", () => { speed = Number(speeds.value); });
+  const faster = by => {
+    speeds.selectedIndex = Math.min(Math.max(speeds.selectedIndex + by, 0), speeds.options.length - 1);
+    speed = Number(speeds.value);
+  };
+  const toggle = name => {
+    show[name] = !show[name];
+    document.getElementById(name).setAttribute("aria-pressed", show[name]);
+    draw();
+  };
+  for (const name of Object.keys(show)) document.getElementById(name).addEventListener("click", () => toggle(name));
+  document.getElementById("field").hidden = !groups.some(g => g.field);
+  const jump = by => { setPlaying(false); seek(time + by); };
+  const keys = {
+    " ": () => setPlaying(!playing), ArrowRight: e => jump(e.shiftKey ? 5 : .5), ArrowLeft: e => jump(e.shiftKey ? -5 : -.5),
+    Home: () => jump(-duration()), End: () => jump(duration()), "+": () => faster(1), "-": () => faster(-1),
+    b: () => toggle("belief"), f: () => toggle("field"), t: () => toggle("trails"),
+  };
   document.getElementById("replay-card").addEventListener("keydown", event => {
-    if (event.target.closest("select, #groups") || event.ctrlKey || event.metaKey || event.altKey) return;
-    if (event.key === " " && event.target.tagName !== "BUTTON") setPlaying(!playing);
-    else if (event.target === scrub) return;
-    else if (event.key === "ArrowRight") { setPlaying(false); seek(time + .5); }
-    else if (event.key === "ArrowLeft") { setPlaying(false); seek(time - .5); }
-    else return;
+    if (event.target.closest("select, #groups") || event.ctrlKey || event.metaKey || event.altKey || !(event.key in keys)) return;
+    if (event.key === " " && event.target.tagName === "BUTTON") return;  // a button's own key
+    keys[event.key](event);
     event.preventDefault();
   });
   window.addEventListener("resize", draw);
