@@ -74,9 +74,9 @@ class Hunters:
         self._playing[arena] = player
         return "" if known is None else json.dumps(known)
 
-    def stop(self) -> None:
-        """No arena has an episode."""
-        self._playing = [None] * len(self._playing)
+    def leave(self, arena: int) -> None:
+        """The arena's episode is over."""
+        self._playing[arena] = None
 
     def act(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
         """Actions ``[N, 2]`` for the egos' observations ``[N, D]``; arenas without an episode get a standing ego."""

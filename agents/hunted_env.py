@@ -4,7 +4,7 @@ stable-baselines3. Being caught ends the episode.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +15,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from tab_marl.agents.hunted_egos import SEEDS, Hunters, hunter_names
 from tab_marl.agents.planners import PlannerOptions
-from tab_marl.agents.training_env import WINDOW
+from tab_marl.agents.training_env import TRAINING, WINDOW, draw_tasks
+from tab_marl.agents.training_settings import TrainingSettings
 from tab_marl.envs.adversary_observation import AdversaryTask, observation_bounds
 from tab_marl.envs.batched_arenas import EVENTS, BatchedArenas
 from tab_marl.envs.episode import draw_starts
@@ -26,10 +27,19 @@ from tab_marl.mission.tasks import Task
 REWARDS = replace(SHAPED, per_step=0.0)
 """Those of the batched training world, but waiting is free: a hunted adversary may need to."""
 VISIT_REWARD = 1.0
-INTERCEPTED, COMPLETED, FAILED = (EVENTS.index(name) for name in ("intercepted", "completed", "failed"))
+DRAWS = 6
+"""Draws of a style's latents per task of a training run."""
+INTERCEPTED, COMPLETED = (EVENTS.index(name) for name in ("intercepted", "completed"))
 
 
-def hunted_tasks(tasks: Sequence[Task], style: Style, seed: int, draws: int, seen_metres: float) -> list[AdversaryTask]:
+def hunted_tasks(
+    tasks: Sequence[Task],
+    style: Style,
+    seed: int,
+    draws: int,
+    seen_metres: float,
+    on_built: Callable[[int, int], None] | None = None,
+) -> list[AdversaryTask]:
     """`draws` draws of the style's habits for each task, one after the other; latents depend on (seed, index) only.
 
     `seen_metres`: the range in which the adversary sees the ego, with a free line of sight; 0: never.
@@ -40,7 +50,21 @@ def hunted_tasks(tasks: Sequence[Task], style: Style, seed: int, draws: int, see
             task.scenario, sensors=replace(task.scenario.sensors, adversary_sees_ego_metres=float(seen_metres))
         )
         found += AdversaryTask.draw(aware, task.mission, style, np.random.default_rng((seed, i)), draws)
+        if on_built is not None:
+            on_built(i + 1, len(tasks))
     return found
+
+
+def hunted_env(settings: TrainingSettings, on_built: Callable[[int, int], None] | None = None) -> HuntedVecEnv:
+    """The hunted world of these settings: `opponent` hunts on ``tasks / DRAWS`` tasks, each with DRAWS draws of the style,
+    since what a planner computes for a task is kept. Raises UnknownName for an ego that nobody knows."""
+    distinct = -(-settings.tasks // DRAWS)
+    tasks = draw_tasks(
+        TRAINING, settings.seed, distinct, settings.missions, settings.families, settings.map, settings.difficulty
+    )
+    built = hunted_tasks(tasks, settings.style, settings.seed, DRAWS, settings.ego_seen_metres, on_built)
+    kinds = [task.mission_id for task in tasks for _ in range(DRAWS)]
+    return HuntedVecEnv(built, kinds, settings.robots, settings.seed, settings.opponent)
 
 
 class HuntedVecEnv(VecEnv):
@@ -181,7 +205,8 @@ class HuntedVecEnv(VecEnv):
         self._told[:, : arrays["told"].shape[1]] = arrays["told"]
         self._learned = list(text["learned"])
         last = int(steps.max())
-        self.hunters.stop()
+        for i in range(self.num_envs):
+            self.hunters.leave(i)
         for now in range(last + 1):
             # Each arena begins so late that all stand where they stood after the last round.
             which = np.flatnonzero(last - steps == now)
