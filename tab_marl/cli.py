@@ -54,6 +54,7 @@ def evaluate(
     out: Out = Path("runs/evaluation"),
     config: Annotated[Path | None, typer.Option(help="TOML file with these settings; options override it.")] = None,
     preset: Annotated[str | None, typer.Option(help="demo (minutes) or paper (150 episodes each).")] = None,
+    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Play again what is stored as failed.")] = False,
 ) -> None:
     """Play missions x families x planners against the zoo; print the tables and write an HTML report.
 
@@ -77,6 +78,7 @@ def evaluate(
         },
     )
     from tab_marl.evaluation.console import notes_console
+    from tab_marl.evaluation.engines.local import LocalEngine
     from tab_marl.evaluation.episode import play_job
     from tab_marl.evaluation.evaluate import play_missing, prepare
     from tab_marl.evaluation.store import Store
@@ -84,7 +86,8 @@ def evaluate(
     notes = notes_console()
     experiment = prepare(settings)
     with Store.create(out) as store:
-        play_missing(experiment, store, play_job, notes, f"tab-marl {shlex.join(sys.argv[1:])}")
+        chosen = LocalEngine(play_job, settings.workers)
+        play_missing(experiment, store, chosen, notes, f"tab-marl {shlex.join(sys.argv[1:])}", retry_failed)
         from tab_marl.evaluation.report.present import present
 
         present(store, store.settings()[0], out, settings.replays, notes)
@@ -169,21 +172,41 @@ def watch(
 
 @app.command()
 def train(
-    style: Annotated[str | None, typer.Option(help="A style by name: direct, ...")] = None,
-    config: Annotated[Path | None, typer.Option(help="TOML file with training settings.")] = None,
+    population: Annotated[
+        Path | None, typer.Argument(help='TOML file of a population, or "shipped"; without it one policy is trained.')
+    ] = None,
+    style: Annotated[str | None, typer.Option(help="Of one policy: a style by name: direct, ...")] = None,
+    algorithm: Annotated[str | None, typer.Option(help="Of one policy: ppo, a2c, sac, td3, tqc, ppo_lstm.")] = None,
+    config: Annotated[Path | None, typer.Option(help="Of one policy: TOML file with training settings.")] = None,
     steps: Annotated[int | None, typer.Option(help="Control steps over all robots.")] = None,
     seed: Annotated[int | None, typer.Option(help="Of initial weights, tasks and exploration.")] = None,
     name: Annotated[str | None, typer.Option(help="Of the policy; default: the style's.")] = None,
+    only: Annotated[str | None, typer.Option(help="Of a population: comma-separated names of members.")] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Of a population: processes; default: one per core.")
+    ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder of the run; default: runs/train/NAME.")
+        Path | None, typer.Option("--out", "-o", help="Folder of the runs; default: runs/train/NAME.")
     ] = None,
 ) -> None:
-    """Train an adversary policy; the same command continues an interrupted run."""
+    """Train adversaries: a population from a file, or one policy. The same command continues what was interrupted."""
     from tab_marl.evaluation.console import notes_console
-    from tab_marl.evaluation.single import train_policy
+    from tab_marl.evaluation.train_command import train_many, train_one
 
+    if population is None:
+        if only is not None or workers is not None:
+            raise UserError("--only and --workers are for a population: give its file")
+        _announce_first_use()
+        changes = {"steps": steps, "seed": seed, "name": name}
+        train_one(style, algorithm, config, changes, out, notes_console())
+        return
+    alone = {"--style": style, "--algorithm": algorithm, "--config": config, "--seed": seed, "--name": name}
+    given = [option for option, value in alone.items() if value is not None]
+    if given:
+        raise UserError(f"{given[0]} is for a single policy: {population} says it for each of its members")
     _announce_first_use()
-    train_policy(style, config, {"steps": steps, "seed": seed, "name": name}, out, notes_console())
+    if not train_many(population, _names(only), workers, steps, out, notes_console()):
+        raise typer.Exit(1)
 
 
 zoo_app = typer.Typer(help="The trained adversaries that ship with the package.", no_args_is_help=True)

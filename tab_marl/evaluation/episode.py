@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import time
@@ -21,10 +22,11 @@ from tab_marl.envs.intercept_v0 import parallel_env
 from tab_marl.evaluation.errors import Interrupted, UserError, require_known
 from tab_marl.evaluation.report.replay import Trace, shrink
 from tab_marl.evaluation.rows import EpisodeRow, Timing
-from tab_marl.evaluation.runner import stop_requested
+from tab_marl.evaluation.engines.local import stop_requested
 from tab_marl.evaluation.units import Job, unit_seeds
 from tab_marl.field.problem import FieldOptions
 from tab_marl.mission.tasks import Task, ego_can_be_first, sample_task
+from tab_marl.world.scenario import Scenario
 
 ADVERSARY_STREAM = 1
 """Separates the adversary's own draws from the environment's, which have the same seed."""
@@ -68,14 +70,16 @@ def run_episode(
         render_mode=render_mode,
         max_cycles=max_steps,
     )
-    began = time.perf_counter()
+    began, clocks = time.perf_counter(), _Clocks()
     scenario = task.scenario
     every = scenario.control_hertz // scenario.decision_hertz
     recorder = _Recorder(task, every) if trace else None
     try:
         observations, _ = env.reset(seed=seed)
-        planner.reset(task, np.random.default_rng(seed if planner_seed is None else planner_seed))
         policy.reset(task, np.random.default_rng(np.random.SeedSequence([seed, ADVERSARY_STREAM])))
+        clocks.simulation += clocks.lap()
+        planner.reset(task, np.random.default_rng(seed if planner_seed is None else planner_seed))
+        clocks.preparation += clocks.lap()
         failed = False
         step = 0
         while True:
@@ -87,9 +91,16 @@ def run_episode(
                 break
             if step % every == 0 and should_stop():
                 raise Interrupted
+            clocks.lap()
             ego = planner.act(observations["ego_0"])
+            spent = clocks.lap()
+            clocks.planner += spent
+            if len(planner.decision_seconds) > clocks.decided:
+                clocks.decided += 1
+                clocks.decisions += spent
             adversary = policy.act(observations["adversary_0"])
             observations, _, _, _, infos = env.step({"ego_0": ego, "adversary_0": adversary})
+            clocks.simulation += clocks.lap()
             failed |= infos["ego_0"]["mission_status"] == "failed"
             step += 1
         episode = env.episode
@@ -117,8 +128,36 @@ def run_episode(
         env.close()
     taken = 1000 * np.asarray(planner.decision_seconds)
     mean, worst = (float(taken.mean()), float(taken.max())) if len(taken) else (float("nan"), float("nan"))
-    timing = Timing(len(taken), mean, worst, time.perf_counter() - began)
+    timing = Timing(
+        len(taken),
+        mean,
+        worst,
+        time.perf_counter() - began,
+        processor_seconds=clocks.total(),
+        preparation_processor_seconds=clocks.preparation,
+        decision_processor_seconds=clocks.decisions,
+        planner_processor_seconds=clocks.preparation + clocks.planner,
+        simulation_processor_seconds=clocks.simulation,
+    )
     return Played(row, timing, None if recorder is None else recorder.trace)
+
+
+class _Clocks:
+    """Where an episode's processor time goes: that of this thread, which other jobs do not lengthen."""
+
+    def __init__(self) -> None:
+        self._began = self._last = time.thread_time()
+        self.preparation = self.planner = self.decisions = self.simulation = 0.0
+        self.decided = 0
+
+    def lap(self) -> float:
+        """Seconds since the last call."""
+        now = time.thread_time()
+        spent, self._last = now - self._last, now
+        return spent
+
+    def total(self) -> float:
+        return time.thread_time() - self._began
 
 
 class _Recorder:
@@ -192,7 +231,8 @@ def _warm(planner: str, task: Task, policy: AdversaryPolicy) -> None:
 
 
 def _broken(job: Job, planner: str, task: Task | None, error: Exception, seconds: float) -> Played:
-    horizon = 0 if task is None else round(task.scenario.horizon_seconds * task.scenario.physics_hertz)
+    scenario = Scenario.preset("lab") if task is None else task.scenario  # its horizon: the longest waiting there is
+    horizon = round(scenario.horizon_seconds * scenario.physics_hertz)
     row = EpisodeRow(
         mission=job.unit.mission,
         family=job.unit.family,
@@ -209,6 +249,20 @@ def _broken(job: Job, planner: str, task: Task | None, error: Exception, seconds
         learned=job.learned,
     )
     return Played(row, Timing(0, float("nan"), float("nan"), seconds, traceback.format_exc()))
+
+
+def lost_job(job: Job, reason: str) -> list[tuple[EpisodeRow, Timing]]:
+    """The rows of episodes that no worker survived: with the error, scored as their planner's worst case."""
+    sequence, _, _ = unit_seeds(job.base_seed, job.unit)
+    task: Task | None = None
+    with contextlib.suppress(Exception):
+        task = sample_task(np.random.default_rng(sequence), job.unit.mission, job.unit.family, job.slack)
+    lost = [_broken(job, planner, task, WorkerLost(reason), 0.0) for planner in job.planners]
+    return [(played.row, replace(played.timing, traceback=None)) for played in lost]
+
+
+class WorkerLost(Exception):
+    """The process that played an episode died."""
 
 
 def _name_in_row(adversary: str) -> str:

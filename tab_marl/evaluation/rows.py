@@ -58,6 +58,16 @@ class Timing:
     max_decision_milliseconds: float
     seconds: float
     traceback: str | None = None
+    processor_seconds: float = float("nan")
+    """Of the whole episode; processor time, which other jobs on the machine do not lengthen."""
+    preparation_processor_seconds: float = float("nan")
+    """Of the planner before its first decision: fields, routes, rollouts (what planners on one task share is paid by the first)."""
+    decision_processor_seconds: float = float("nan")
+    """Of all decisions together, belief updates included."""
+    planner_processor_seconds: float = float("nan")
+    """Of everything that the planner did: preparation, decisions, steering."""
+    simulation_processor_seconds: float = float("nan")
+    """Of the environment and the adversary's policy."""
 
 
 def scored_completed(row: EpisodeRow) -> bool:

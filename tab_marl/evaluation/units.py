@@ -104,6 +104,11 @@ class Schedule:
         m, f = self._settings.missions.index(unit.mission), self._settings.families.index(unit.family)
         heapq.heappush(self._heap, (unit.seed, m, f, 0, self._job(unit, (planner,), learned)))
 
+    @property
+    def ready(self) -> bool:
+        """Whether a job can be played now."""
+        return bool(self._heap)
+
     def pop(self) -> Job | None:
         """The next job that can be played now."""
         return heapq.heappop(self._heap)[-1] if self._heap else None

@@ -79,34 +79,45 @@ def play_slowly(job: Job):
 
 
 def play_and_break(job: Job):
-    """A worker that is killed in the middle."""
-    if job.unit.seed == 3:
-        os.kill(os.getpid(), signal.SIGKILL)
+    """Workers die of one planner's episode, always, and of another's the first time."""
+    if job.unit.seed == 3 and job.unit.mission == "M4":
+        if "TAB-POMCP" in job.planners:
+            os.kill(os.getpid(), signal.SIGKILL)
+        marker = Path(os.environ["SYNTHETIC_MARKER"])
+        if "MLE-POMCP" in job.planners and not marker.exists():
+            marker.write_text("")
+            os.kill(os.getpid(), signal.SIGKILL)
     return play(job)
 
 
-def evaluate_folder(folder: str, episodes: str, workers: str) -> None:
+def play_and_always_break(job: Job):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def play_noting(job: Job):
+    """Each episode leaves a line: to see how often it was played, and by whom."""
+    with Path(os.environ["SYNTHETIC_MARKER"]).open("a") as log:
+        for planner in job.planners:
+            log.write(f"{job.unit.mission} {job.unit.family} {planner} {job.unit.seed} {os.getppid()}\n")
+    return play_slowly(job)
+
+
+def evaluate_folder(folder: str, episodes: str, workers: str, play: str = "play_slowly") -> None:
     """A whole evaluation with synthetic episodes, to be run, and killed, as a process of its own."""
+    import synthetic_rows
+    from tab_marl.evaluation.engines.local import LocalEngine
     from tab_marl.evaluation.runner import run
     from tab_marl.evaluation.settings import EvaluationSettings, settings_key
     from tab_marl.evaluation.store import Store
 
-    settings = EvaluationSettings(
-        ("M1", "M3"),
-        ("point",),
-        ("S-POMCP", "MLE-POMCP", "TAB-POMCP"),
-        (),
-        int(episodes),
-        7,
-        None,
-        "default",
-        int(workers),
-    )
+    settings = EvaluationSettings(("M1", "M3"), ("point",), ("S-POMCP", "MLE-POMCP", "TAB-POMCP"), (), int(episodes), 7)
     with Store.create(Path(folder)) as store:
         content = settings.content("code", ("a", "b"))
         key = settings_key(content)
         store.use(key, content, {})
-        run(settings, ("a", "b"), store, key, play_slowly)
+        run_id = store.begin_run(key, {})
+        run(settings, ("a", "b"), store, key, LocalEngine(getattr(synthetic_rows, play), int(workers)), run_id)
+        store.end_run(run_id, "finished")
 
 
 if __name__ == "__main__":
