@@ -7,10 +7,10 @@ name                adversary model
 ==================  ====================================================================================================
 S-POMCP             uniform random moves within the speed limit
 FP-POMCP            the shortest path to the mission's objectives at full speed
-MLE-POMCP           moves counted from sightings, kept feasible; keeps learning across episodes
+MLE-POMCP           moves counted from sightings of the development policies and of this episode, kept feasible
 TAB-POMCP           the TAB-Field's bridge kernel
 oracle              the TAB-Field's, and the adversary is always seen (environment option `full_observation`)
-population-POMCP    trajectories of trained adversaries, weighted by what was seen
+population-POMCP    trajectories of the very policies that may be played, weighted by what was seen: a ceiling
 random              none: drives to random waypoints
 ==================  ====================================================================================================
 """
@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tab_marl.agents.planner_memory import PlannerMemory
+from tab_marl.agents.pretraining import pretrained
 from tab_marl.envs.ego_observation import EgoView, parse_ego_observation
 from tab_marl.field.problem import FieldOptions
 from tab_marl.mission.propositions import region_of
@@ -68,7 +69,12 @@ class PlannerOptions:
     particles: int = 3000
     """Of S-POMCP and MLE-POMCP."""
     rollouts: Rollouts | None = None
-    """Of population-POMCP; None: the zoo that ships with the package."""
+    """Of population-POMCP; None: every policy that ships with the package, those of the final table among them."""
+    moves: MoveCounts | None = None
+    """What MLE-POMCP has counted before; None: the development policies' moves (`tab_marl.agents.pretraining`)."""
+    carries_moves: bool = False
+    """Whether MLE-POMCP takes what it counts in one episode into the next. In a table that would be data from the
+    policies that it is judged against."""
     memory: PlannerMemory | None = None
     """Keeps what depends on the task alone, where the same tasks come again and again."""
 
@@ -129,12 +135,14 @@ class PlannerAgent:
         self.decision_seconds: list[float] = []
         self.decision_parts: list[DecisionParts] = []
         self.decision: Decision | None = None
-        self.moves = untrained() if name == "MLE-POMCP" else None
+        self.moves = self._first_moves() if name == "MLE-POMCP" else None
         self._model: AdversaryModel | None = None
 
     def reset(self, task: Task, rng: np.random.Generator) -> None:
         scenario = task.scenario
         self.task, self.rng = task, rng
+        if self.moves is not None and not self.options.carries_moves:
+            self.moves = self._first_moves()
         memory = self.options.memory
         self.routes = (RouteMap.build if memory is None else memory.routes)(
             scenario, goal_places(task), self.options.routes
@@ -181,11 +189,16 @@ class PlannerAgent:
         return 0 if self._model is None else self._model.fallbacks
 
     def learned_state(self) -> dict[str, Any] | None:
-        return None if self.moves is None else self.moves.to_json()
+        carried = self.moves if self.options.carries_moves else None
+        return None if carried is None else carried.to_json()
 
     def restore(self, state: Mapping[str, Any] | None) -> None:
         if self.moves is not None:
-            self.moves = untrained() if state is None else MoveCounts.from_json(state)
+            self.moves = self._first_moves() if state is None else MoveCounts.from_json(state)
+
+    def _first_moves(self) -> MoveCounts:
+        given = self.options.moves
+        return pretrained() if given is None else MoveCounts.from_json(given.to_json())
 
     def _make_model(self, task: Task, rng: np.random.Generator) -> EvidentModel:
         scenario, mission, options = task.scenario, task.mission, self.options
@@ -235,11 +248,6 @@ class PlannerAgent:
             DecisionParts(self._belief_seconds, sampling, chosen.valuation_seconds, chosen.search_seconds)
         )
         self.decision, self._belief_seconds = chosen, 0.0
-
-
-def untrained() -> MoveCounts:
-    """What MLE-POMCP believes before it saw anything: half uniform moves, half along the mission's way."""
-    return MoveCounts(along_share=0.5)
 
 
 class RandomAgent:

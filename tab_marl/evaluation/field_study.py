@@ -17,7 +17,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from tab_marl.agents.planners import PlannerOptions, untrained
+from tab_marl.agents.planners import PlannerOptions
+from tab_marl.agents.pretraining import untrained
 from tab_marl.agents.rollouts import rollout_unopposed
 from tab_marl.agents.zoo import find_policy
 from tab_marl.evaluation.prediction import Forecast, kernel_forecast, mixed
