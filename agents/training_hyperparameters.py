@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import difflib
 import inspect
+import math
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -46,6 +47,12 @@ NOT_HERE = {
     "verbose": "it is the program's own",
 }
 """Keys that rl-baselines3-zoo or the algorithms know and that mean nothing here, with the reason."""
+
+_BOUNDS = {
+    **dict.fromkeys(("gamma", "gae_lambda", "tau"), (0.0, 1.0)),
+    **dict.fromkeys(("n_steps", "n_epochs", "batch_size", "buffer_size"), (1.0, math.inf)),
+    **dict.fromkeys(("learning_starts", "noise_std"), (0.0, math.inf)),
+}
 
 
 class HyperparameterError(ValueError):
@@ -151,6 +158,10 @@ def check(algorithm: str, hyperparameters: Mapping[str, Any]) -> None:
             raise HyperparameterError(f"{ALGORITHMS[algorithm].title} has no hyperparameter {name!r}: {hint}")
         if name in ("learning_rate", "clip_range", "clip_range_vf"):
             schedule(value, f"hyperparameters.{name}")
+        low, high = _BOUNDS.get(name, (-math.inf, math.inf))
+        if math.isfinite(low) and not (isinstance(value, int | float) and low <= value <= high):
+            within = f"be >= {low:g}" if math.isinf(high) else f"lie in {low:g}..{high:g}"
+            raise HyperparameterError(f"hyperparameters.{name} is {value!r}, must {within}")
     if hyperparameters.get("noise_type", "normal") != "normal":
         raise HyperparameterError(
             f"hyperparameters.noise_type is {hyperparameters['noise_type']!r}, must be 'normal': a run with another could "

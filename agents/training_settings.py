@@ -16,6 +16,7 @@ from typing import Any, ClassVar
 import tomli_w
 from pydantic import TypeAdapter, ValidationError
 
+from tab_marl.agents.cards import is_name
 from tab_marl.agents.training_algorithms import ALGORITHMS
 from tab_marl.agents.training_hyperparameters import (
     ACTIVATIONS,
@@ -105,8 +106,10 @@ class TrainingSettings:
             raise UnknownName("split", self.split, SPLITS)
         if not self.missions or not self.families:
             raise TrainingError("TrainingSettings.missions and .families must not be empty")
-        if not self.name or any(c in self.name for c in "/\\") or self.name.startswith("."):
-            raise TrainingError(f"TrainingSettings.name is {self.name!r}, must be usable as a folder's name")
+        if not is_name(self.name):
+            raise TrainingError(
+                f"TrainingSettings.name is {self.name!r}, must be usable as a folder's name: letters, digits, '.', '_', '-'"
+            )
         self._check_tasks()
         try:
             self._complete()
@@ -198,7 +201,7 @@ class TrainingSettings:
             if data["style"] not in STYLES:
                 raise TrainingError(f"{where}: {UnknownName('style', data['style'], STYLES)}")
             data.setdefault("name", data["style"])
-            data["style"] = _without_none(dataclasses.asdict(STYLES[data["style"]]))
+            data["style"] = as_toml(STYLES[data["style"]])
         try:
             return TypeAdapter(cls).validate_python(data)
         except (ValidationError, UnknownName) as error:
@@ -206,7 +209,7 @@ class TrainingSettings:
 
     def to_toml(self) -> str:
         """The settings as TOML text that `from_toml` reads."""
-        return tomli_w.dumps(_without_none(dataclasses.asdict(self)))
+        return tomli_w.dumps(as_toml(self))
 
 
 def read_toml(path: Path | str) -> dict[str, Any]:
@@ -233,6 +236,12 @@ def _actor_layers(policy: Mapping[str, Any]) -> tuple[int, ...]:
     if not isinstance(layers, list | tuple) or any(isinstance(x, bool) or not isinstance(x, int) for x in layers):
         raise HyperparameterError(f"net_arch is {layers!r}, must be a list of widths, or dict(pi=[...], qf=[...])")
     return tuple(layers)
+
+
+def as_toml(settings: Any) -> dict[str, Any]:
+    """Settings (a dataclass) as what a TOML table holds."""
+    found: dict[str, Any] = _without_none(dataclasses.asdict(settings))
+    return found
 
 
 def _without_none(value: Any) -> Any:

@@ -298,15 +298,26 @@ def _algorithm(model: Any) -> str:
 POLICY_FOLDER = "policy"
 
 
-def export_policy(model: Any, settings: TrainingSettings, out_dir: Path | str) -> Path:
-    """Write the actor of a trained model to ``out_dir/policy`` and return that folder. Raises OSError."""
-    usual = settings.style.name in STYLES and settings == TrainingSettings.for_style(
-        settings.style.name, name=settings.name, seed=settings.seed, steps=settings.steps
-    )
-    command = f"tab-marl train --style {settings.style.name} --name {settings.name} --seed {settings.seed} --steps {settings.steps}"
-    policy = policy_of(
-        model, settings, int(model.num_timesteps), command if usual else "tab-marl train --config settings.toml"
-    )
+def export_policy(model: Any, settings: TrainingSettings, out_dir: Path | str, command: str | None = None) -> Path:
+    """Write the actor of a trained model to ``out_dir/policy`` and return that folder. Raises OSError.
+
+    command: what trains it again; None: `tab-marl train` with options, or with the settings file.
+    """
+    if command is None:
+        usual = settings.style.name in STYLES and settings == TrainingSettings.for_style(
+            settings.style.name,
+            name=settings.name,
+            algorithm=settings.algorithm,
+            seed=settings.seed,
+            steps=settings.steps,
+        )
+        command = (
+            f"tab-marl train --style {settings.style.name} --algorithm {settings.algorithm} --name {settings.name} "
+            f"--seed {settings.seed} --steps {settings.steps}"
+            if usual
+            else "tab-marl train --config settings.toml"
+        )
+    policy = policy_of(model, settings, int(model.num_timesteps), command, settings.description)
     folder = Path(out_dir) / POLICY_FOLDER
     save_policy(policy, folder)
     return folder

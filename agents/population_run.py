@@ -1,0 +1,217 @@
+"""Trains the members of a population in processes of their own, one thread each.
+
+The process that calls `train_population` only watches. A member that fails, or whose process dies, is reported and the
+others go on; whatever is killed, the same call continues every member from its last checkpoint.
+"""
+
+from __future__ import annotations
+
+import multiprocessing as mp
+import os
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Any
+
+from tab_marl.agents.population import Population
+from tab_marl.agents.training_algorithms import ALGORITHMS
+from tab_marl.agents.training_settings import UNOPPOSED, TrainingError, TrainingSettings
+
+WAITING, TASKS, TRAINING, DONE, FAILED = "waiting", "tasks", "training", "done", "failed"
+ERROR_FILE = "error.txt"
+"""In a member's folder: the traceback of what ended it."""
+START_SECONDS = 20.0
+"""CPU seconds before a member's first step (imports, tasks), for the estimate of what is left."""
+HUNTED_FACTOR = 20.0
+"""A guess of how much longer a hunted member's step takes, until one has been seen."""
+POLL_SECONDS = 1.0
+_ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+@dataclass(frozen=True)
+class MemberStand:
+    """Where a member stands."""
+
+    settings: TrainingSettings
+    folder: Path
+    status: str = WAITING
+    steps: int = 0
+    cpu_seconds: float = 0.0
+    steps_per_second: float = 0.0
+    success: dict[str, float] | None = None
+    error: str = ""
+    """One line, if it failed."""
+
+    @property
+    def name(self) -> str:
+        return self.settings.name
+
+    @property
+    def ended(self) -> bool:
+        return self.status in (DONE, FAILED)
+
+
+Stands = dict[str, MemberStand]
+OnStand = Callable[[MemberStand, Stands], None]
+
+
+def train_population(
+    population: Population, out_dir: Path | str, workers: int = 1, on_stand: OnStand | None = None
+) -> Stands:
+    """Train, or continue, every member in ``out_dir/<name>``; returns how each ended, by name.
+
+    on_stand: told of every change, with the stands of all. Raises TrainingError for fewer than one worker; OSError if
+    `out_dir` cannot be written. KeyboardInterrupt ends the workers; they lose what came after their last checkpoint.
+    """
+    if workers < 1:
+        raise TrainingError(f"workers is {workers}, must be >= 1")
+    out = Path(out_dir)
+    out.mkdir(parents=True, exist_ok=True)
+    stands: Stands = {m.name: MemberStand(m, out / m.name) for m in population.members}
+
+    def tell(name: str, **changes: Any) -> None:
+        stands[name] = replace(stands[name], **changes)
+        if on_stand is not None:
+            on_stand(stands[name], stands)
+
+    for name, stand in stands.items():
+        if finished(stand.settings, stand.folder):
+            tell(name, status=DONE, steps=stand.settings.steps, cpu_seconds=_logged_seconds(stand.folder))
+    # The longest first: else the last worker is left alone with one of them.
+    queue = sorted((s for s in stands.values() if not s.ended), key=lambda s: -expected_seconds(s.settings))
+    running: dict[Any, tuple[str, Any]] = {}
+    context = mp.get_context("spawn")
+    try:
+        with _one_thread():
+            while queue or running:
+                while queue and len(running) < workers:
+                    stand = queue.pop(0)
+                    receive, send = context.Pipe(duplex=False)
+                    arguments = (stand.settings, stand.folder, population.command(stand.settings), send)
+                    process = context.Process(target=_work, args=arguments, daemon=True, name=stand.name)
+                    process.start()
+                    send.close()
+                    running[receive] = (stand.name, process)
+                    tell(stand.name, status=TASKS)
+                for receive in wait(list(running), timeout=POLL_SECONDS):
+                    assert isinstance(receive, Connection)
+                    name, process = running[receive]
+                    try:
+                        tell(name, **receive.recv())
+                    except EOFError:
+                        del running[receive]
+                        receive.close()
+                        process.join()
+                        if not stands[name].ended:
+                            tell(name, status=FAILED, error=f"its process ended with status {process.exitcode}")
+    finally:
+        for receive, (_, process) in running.items():
+            process.terminate()
+            process.join()
+            receive.close()
+    return stands
+
+
+def _work(settings: TrainingSettings, folder: Path, command: str, send: Connection) -> None:
+    """One member, in a process of its own; tells the parent what to change in its stand."""
+    from tab_marl.agents.training import Progress, train
+    from tab_marl.agents.zoo import export_policy
+
+    def tell(stand: Progress) -> None:
+        if stand.phase != "tasks":
+            send.send(
+                {
+                    "status": TRAINING,
+                    "steps": stand.done,
+                    "cpu_seconds": stand.cpu_seconds,
+                    "steps_per_second": stand.steps_per_second,
+                    "success": stand.success,
+                }
+            )
+
+    try:
+        model = train(settings, folder, tell)
+        export_policy(model, settings, folder, command)
+        (folder / ERROR_FILE).unlink(missing_ok=True)
+        send.send({"status": DONE, "steps": int(model.num_timesteps), "cpu_seconds": _logged_seconds(folder)})
+    except KeyboardInterrupt:
+        pass  # the parent was told, too
+    except BrokenPipeError:
+        pass  # the parent is gone; whoever starts again continues from the checkpoint
+    except Exception as error:  # noqa: BLE001, whatever it is, the others must go on
+        if folder.is_dir():
+            (folder / ERROR_FILE).write_text(traceback.format_exc(), encoding="utf-8")
+        send.send({"status": FAILED, "error": " ".join(f"{type(error).__name__}: {error}".split())})
+    finally:
+        send.close()
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Processes started inside compute with one thread each."""
+    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def finished(settings: TrainingSettings, folder: Path) -> bool:
+    """Whether the folder holds the exported policy of a run with exactly these settings."""
+    from tab_marl.agents.zoo import CARD_FILE, POLICY_FOLDER
+
+    card, kept = folder / POLICY_FOLDER / CARD_FILE, folder / "settings.toml"
+    try:
+        if card.stat().st_mtime_ns < kept.stat().st_mtime_ns:
+            return False  # continued since, under another split or description
+        theirs = TrainingSettings.from_toml(kept)
+    except (OSError, TrainingError):
+        return False
+    return replace(theirs, checkpoint_seconds=settings.checkpoint_seconds) == settings
+
+
+def _logged_seconds(folder: Path) -> float:
+    from tab_marl.agents.training_log import read_log
+
+    try:
+        return float(read_log(folder).cpu_seconds[-1])
+    except (OSError, ValueError, IndexError):
+        return 0.0
+
+
+def expected_seconds(settings: TrainingSettings) -> float:
+    """A guess of the CPU seconds that a member takes from its beginning to its end."""
+    per_kilostep = ALGORITHMS[settings.algorithm].seconds_per_kilostep
+    factor = 1.0 if settings.opponent == UNOPPOSED else HUNTED_FACTOR
+    return START_SECONDS + per_kilostep * factor * settings.steps / 1000.0
+
+
+def seconds_left(stands: Stands, workers: int) -> float:
+    """Wall seconds until all members have ended, from the rates seen so far."""
+    left = []
+    for stand in stands.values():
+        if stand.ended:
+            continue
+        if stand.steps_per_second > 0:
+            left.append((stand.settings.steps - stand.steps) / stand.steps_per_second)
+        else:
+            left.append(expected_seconds(stand.settings) * _slowness(stand.settings, stands))
+    busy = min(workers, max(len(left), 1))
+    return max(sum(left) / busy, max(left, default=0.0))
+
+
+def _slowness(settings: TrainingSettings, stands: Stands) -> float:
+    """Seconds taken over seconds expected, of members of the same kind, or of all that have run."""
+    hunted = settings.opponent != UNOPPOSED
+    seen = [s for s in stands.values() if s.cpu_seconds > 0 and s.steps > 0]
+    alike = [s for s in seen if (s.settings.opponent != UNOPPOSED) == hunted]
+    pairs = [(s.cpu_seconds, expected_seconds(replace(s.settings, steps=s.steps))) for s in alike]
+    return sum(took for took, _ in pairs) / sum(expected for _, expected in pairs) if pairs else 1.0
