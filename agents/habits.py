@@ -25,6 +25,8 @@ from tab_marl.agents.adversaries import AdversaryPolicy
 from tab_marl.agents.hunted_egos import SEEDS, hunter_names, hunting_options
 from tab_marl.agents.hunted_play import play_hunted
 from tab_marl.agents.rollouts import rollout_unopposed
+from tab_marl.agents.training_env import TRAINING, draw_tasks
+from tab_marl.agents.training_settings import TrainingError, TrainingSettings
 from tab_marl.envs.adversary_observation import AdversaryTask, leaves_choice
 from tab_marl.envs.styles import Habit, Style
 from tab_marl.mission.tasks import Task
@@ -39,7 +41,8 @@ OWN_ROLLOUTS = 3
 """Trajectories per task and habit that population-POMCP knows."""
 POOL = 60
 """Trajectories in its belief, drawn by the present mixture."""
-INFORMED = "population-POMCP"
+TASKS = 40
+"""Tasks on which a training run learns its habits: their fields are solved once and kept."""
 
 
 @dataclass(frozen=True)
@@ -191,6 +194,38 @@ def learn_habits(
         if on_round is not None:
             on_round(update + 1, settings.updates)
     return with_weights(style, learner.average())
+
+
+def learn_for(
+    settings: TrainingSettings, model: Any, folder: Path, on_round: Callable[[int, int], None] | None = None
+) -> Style:
+    """`learn_habits` of a training run, with the actor of its model, on the first tasks of its bank.
+
+    Families of one small goal are left out where there are others: whoever waits there wins, whatever the adversary does.
+    Raises TrainingError.
+    """
+    from tab_marl.agents.zoo import policy_of
+
+    families = tuple(family for family in settings.families if family != "point") or settings.families
+    tasks = draw_tasks(
+        TRAINING,
+        settings.seed,
+        min(settings.tasks, TASKS),
+        settings.missions,
+        families,
+        settings.map,
+        settings.difficulty,
+    )
+    try:
+        asked = HabitSettings(
+            egos=hunter_names(settings.habits_against),
+            episodes=settings.habit_episodes,
+            seen_metres=settings.ego_seen_metres,
+            seed=settings.seed,
+        )
+        return learn_habits(policy_of(model, settings, settings.steps), settings.style, tasks, asked, folder, on_round)
+    except ValueError as error:
+        raise TrainingError(f"{settings.name}: {error}") from None
 
 
 def aware_task(task: Task, style: Style, rng: np.random.Generator, seen_metres: float) -> AdversaryTask:

@@ -58,12 +58,13 @@ def hunted_tasks(
 def hunted_env(settings: TrainingSettings, on_built: Callable[[int, int], None] | None = None) -> HuntedVecEnv:
     """The hunted world of these settings: `opponent` hunts on ``tasks / DRAWS`` tasks, each with DRAWS draws of the style,
     since what a planner computes for a task is kept. Raises UnknownName for an ego that nobody knows."""
-    distinct = -(-settings.tasks // DRAWS)
+    draws = DRAWS if settings.difficulty is None else 1  # the curriculum knows each task's difficulty by its number
+    distinct = -(-settings.tasks // draws)
     tasks = draw_tasks(
         TRAINING, settings.seed, distinct, settings.missions, settings.families, settings.map, settings.difficulty
     )
-    built = hunted_tasks(tasks, settings.style, settings.seed, DRAWS, settings.ego_seen_metres, on_built)
-    kinds = [task.mission_id for task in tasks for _ in range(DRAWS)]
+    built = hunted_tasks(tasks, settings.style, settings.seed, draws, settings.ego_seen_metres, on_built)
+    kinds = [task.mission_id for task in tasks for _ in range(draws)]
     return HuntedVecEnv(built, kinds, settings.robots, settings.seed, settings.opponent)
 
 

@@ -75,7 +75,10 @@ def train(settings: TrainingSettings, out_dir: Path | str, on_progress: OnProgre
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # the networks are small: one thread is fastest, and results do not depend on the machine
     try:
-        return _train(settings, folder, on_progress)
+        model = _train(settings, folder, on_progress)
+        if settings.habits_against:
+            _learn_habits(settings, model, folder, on_progress)
+        return model
     finally:
         torch.set_num_threads(threads)
 
@@ -119,6 +122,16 @@ def _train(settings: TrainingSettings, folder: Path, on_progress: OnProgress | N
     return model
 
 
+def _learn_habits(settings: TrainingSettings, model: Any, folder: Path, on_progress: OnProgress | None) -> None:
+    from tab_marl.agents.habits import learn_for
+
+    def learned(done: int, total: int) -> None:
+        if on_progress is not None:
+            on_progress(Progress("habits", done, total, 0.0, {}))
+
+    learn_for(settings, model, folder, learned)
+
+
 def _environment(settings: TrainingSettings, on_progress: OnProgress | None) -> Any:
     """The VecEnv that the settings ask for."""
 
@@ -126,18 +139,16 @@ def _environment(settings: TrainingSettings, on_progress: OnProgress | None) -> 
         if on_progress is not None and (done % 20 == 0 or done == total):
             on_progress(Progress("tasks", done, total, 0.0, {}))
 
+    if settings.opponent != UNOPPOSED:
+        from tab_marl.agents.hunted_env import hunted_env
+
+        return hunted_env(settings, built)
     tasks = draw_tasks(
         TRAINING, settings.seed, settings.tasks, settings.missions, settings.families, settings.map, settings.difficulty
     )
+    bank = build_bank(tasks, settings.style, settings.seed, built)
     kinds = [task.mission_id for task in tasks]
-    if settings.opponent == UNOPPOSED:
-        bank = build_bank(tasks, settings.style, settings.seed, built)
-        return BatchedVecEnv(bank, kinds, settings.robots, settings.seed, settings.ego_seen_metres)
-    from tab_marl.agents.hunted_env import HuntedVecEnv, hunted_tasks
-
-    hunted = hunted_tasks(tasks, settings.style, settings.seed, 1, settings.ego_seen_metres)
-    built(len(hunted), len(hunted))
-    return HuntedVecEnv(hunted, kinds, settings.robots, settings.seed, settings.opponent)
+    return BatchedVecEnv(bank, kinds, settings.robots, settings.seed, settings.ego_seen_metres)
 
 
 def build_model(settings: TrainingSettings, env: Any) -> BaseAlgorithm:

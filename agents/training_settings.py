@@ -54,6 +54,11 @@ class TrainingSettings:
     """A name of `ALGORITHMS`, which are rl-baselines3-zoo's."""
     opponent: str = UNOPPOSED
     """Who hunts it: "none", "pursue", a policy of the ego side (a folder or a zip), or a planner such as "TAB-POMCP"."""
+    habits_against: str = ""
+    """Egos against which the weights of the style's mixture are learned when the policy is trained ("FP-POMCP+TAB-POMCP": one
+    of them per episode; population-POMCP knows the present mixture); "": the weights stay."""
+    habit_episodes: int = 1000
+    """Hunted episodes from which they are learned."""
     initial: str = ""
     """A policy of the zoo, or the folder of a run or policy, whose weights it begins with; "": random ones."""
     split: str = SPLITS[0]
@@ -104,6 +109,13 @@ class TrainingSettings:
             raise UnknownName("algorithm", self.algorithm, ALGORITHMS)
         if self.split not in SPLITS:
             raise UnknownName("split", self.split, SPLITS)
+        if self.habit_episodes < 1:
+            raise TrainingError(f"TrainingSettings.habit_episodes is {self.habit_episodes}, must be >= 1")
+        if self.habits_against and not self.style.mixture:
+            raise TrainingError(
+                f"TrainingSettings.habits_against is {self.habits_against!r}, but the style {self.style.name!r} has no mixture "
+                'to choose from: take style = "habits"'
+            )
         if not self.missions or not self.families:
             raise TrainingError("TrainingSettings.missions and .families must not be empty")
         if not is_name(self.name):

@@ -317,7 +317,11 @@ def export_policy(model: Any, settings: TrainingSettings, out_dir: Path | str, c
             if usual
             else "tab-marl train --config settings.toml"
         )
+    from tab_marl.agents.habits import learned_style
+
     policy = policy_of(model, settings, int(model.num_timesteps), command, settings.description)
+    style = learned_style(settings.style, out_dir)
+    policy = dataclasses.replace(policy, card=policy.card.model_copy(update={"style": style}))
     folder = Path(out_dir) / POLICY_FOLDER
     save_policy(policy, folder)
     return folder
