@@ -16,7 +16,7 @@ from rich.table import Table
 
 from tab_marl.agents.planners import PlannerAgent, PlannerOptions, RandomAgent
 from tab_marl.envs.intercept_v0 import parallel_env
-from tab_marl.evaluation.episode import opponent, zoo_names
+from tab_marl.evaluation.adversaries import opponent, zoo_names
 from tab_marl.mission.tasks import Task, sample_task
 from tab_marl.planning.pursuit.decide import PursuitOptions
 

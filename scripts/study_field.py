@@ -9,10 +9,12 @@ import typer
 from rich.progress import track
 
 from tab_marl.evaluation import field_figures, field_pursuit, field_study
+from tab_marl.evaluation.adversaries import zoo_names
 from tab_marl.evaluation.units import Unit
 
 OUT = Path("runs/study-field")
-HELD_OUT = ("camera-shy", "fickle", "via", "wander")
+POLICIES = zoo_names("development")
+"""The study chooses among fields: the policies of the final table are none of its business."""
 app = typer.Typer(add_completion=False)
 
 
@@ -32,7 +34,7 @@ def predict(
         for family in ("point", "perimeter", "ambiguous")
         for s in slack
     ]
-    done = field_study.play(cells, HELD_OUT, seed, out / "forecasts", workers)
+    done = field_study.play(cells, POLICIES, seed, out / "forecasts", workers)
     for _ in track(done, "tasks", total=len(cells)):
         pass
 
@@ -48,7 +50,7 @@ def pursue(
 ) -> None:
     """Let TAB-POMCP plan with each field; resumes where it stopped."""
     units = [Unit(mission, family, k) for k in range(episodes) for mission in missions.split(",")]
-    done = field_pursuit.play(units, fields.split(";"), HELD_OUT, seed, out / "episodes.csv")
+    done = field_pursuit.play(units, fields.split(";"), POLICIES, seed, out / "episodes.csv")
     for _ in track(done, "episodes", total=len(units)):
         pass
 

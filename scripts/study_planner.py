@@ -15,7 +15,8 @@ import numpy as np
 import typer
 
 from tab_marl.agents.planners import PlannerAgent, PlannerOptions
-from tab_marl.evaluation.episode import opponent, run_episode, zoo_names
+from tab_marl.evaluation.adversaries import opponent, zoo_names
+from tab_marl.evaluation.episode import run_episode
 from tab_marl.evaluation.units import Unit, unit_seeds
 from tab_marl.field.problem import FieldOptions
 from tab_marl.mission.tasks import Task, sample_task
@@ -67,7 +68,7 @@ VARIANTS: dict[str, Variant] = {
 def play(name: str, variant: Variant, task: Task, unit: Unit, warm: bool = False) -> dict[str, object]:
     """One episode, as a row."""
     _, episode_seed, planner_seed = unit_seeds(BASE_SEED, unit)
-    names = zoo_names()
+    names = zoo_names("development")
     agent = PlannerAgent(variant.planner, variant.options)
     policy = opponent(names[unit.seed % len(names)])
     row = run_episode(

@@ -31,6 +31,21 @@ EXIT_INTERRUPTED = 130
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the episodes and the report.")]
 
 
+def _use_zoo(folder: Path | None) -> Path | None:
+    """Take a folder as the user's zoo, here and in every process started from here."""
+    if folder is not None:
+        os.environ["TAB_MARL_ZOO"] = str(folder.expanduser().resolve())
+    return folder
+
+
+UserZoo = Annotated[
+    Path | None,
+    typer.Option(
+        "--zoo", callback=_use_zoo, help="Folder of your own policies; default: $TAB_MARL_ZOO, or your data folder."
+    ),
+]
+
+
 def _names(text: str | None) -> tuple[str, ...] | None:
     """Comma-separated names; None if the option was not given."""
     return None if text is None else tuple(part.strip() for part in text.split(",") if part.strip())
@@ -42,7 +57,14 @@ def evaluate(
     families: Annotated[str | None, typer.Option(help="Comma-separated: point, perimeter, ambiguous.")] = None,
     planners: Annotated[str | None, typer.Option(help="Comma-separated planner names.")] = None,
     adversaries: Annotated[
-        str | None, typer.Option(help="Comma-separated: zoo policies, folders of policies, scripted.")
+        str | None,
+        typer.Option(
+            help="Comma-separated: policies of the zoo, folders of policies, scripted, or a split (development, final, "
+            "all); default: final."
+        ),
+    ] = None,
+    mix_splits: Annotated[
+        bool | None, typer.Option("--mix-splits", help="Let policies for development and final ones share a table.")
     ] = None,
     episodes: Annotated[int | None, typer.Option(help="Episodes per mission, family and planner.")] = None,
     seed: Annotated[int | None, typer.Option(help="Base seed of tasks, adversaries and noise.")] = None,
@@ -54,6 +76,7 @@ def evaluate(
     out: Out = Path("runs/evaluation"),
     config: Annotated[Path | None, typer.Option(help="TOML file with these settings; options override it.")] = None,
     preset: Annotated[str | None, typer.Option(help="demo (minutes) or paper (150 episodes each).")] = None,
+    zoo: UserZoo = None,
     retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Play again what is stored as failed.")] = False,
 ) -> None:
     """Play missions x families x planners against the zoo; print the tables and write an HTML report.
@@ -70,6 +93,7 @@ def evaluate(
             "families": _names(families),
             "planners": _names(planners),
             "adversaries": _names(adversaries),
+            "mix_splits": mix_splits,
             "episodes": episodes,
             "seed": seed,
             "slack": slack,
@@ -156,8 +180,10 @@ def watch(
     scenario: Annotated[str, typer.Option(help="random, or the name of a scenario.")] = "random",
     planner: Annotated[str, typer.Option(help="Who drives the ego.")] = "TAB-POMCP",
     adversary: Annotated[
-        str | None, typer.Option(help="A zoo policy, a folder, or scripted; default: the first of the zoo.")
+        str | None,
+        typer.Option(help="A policy of the zoo, a folder, or scripted; default: the first of the final split."),
     ] = None,
+    zoo: UserZoo = None,
     seed: Annotated[int, typer.Option(min=0, help="Decides map, starts and noise.")] = 0,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="A .gif, .mp4 or folder of PNGs instead of a window.")

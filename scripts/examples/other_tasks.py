@@ -20,7 +20,7 @@ from rich.table import Table
 from tab_marl.agents.planners import PlannerAgent, PlannerOptions, RandomAgent, goal_places
 from tab_marl.envs.ego_observation import parse_ego_observation
 from tab_marl.envs.intercept_v0 import parallel_env
-from tab_marl.evaluation.episode import opponent, zoo_names
+from tab_marl.evaluation.adversaries import opponent, zoo_names
 from tab_marl.evaluation.film import write_film
 from tab_marl.evaluation.statistics import bootstrap_mean, share
 from tab_marl.mission.tasks import Task, sample_task

@@ -7,22 +7,21 @@ import json
 import os
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tab_marl.agents.adversaries import AdversaryPolicy, ScriptedAdversary
+from tab_marl.agents.adversaries import AdversaryPolicy
 from tab_marl.agents.planners import EgoAgent, PlannerOptions, make_planner
-from tab_marl.agents.zoo import find_policy, load_policy, load_zoo
 from tab_marl.envs.intercept_v0 import parallel_env
-from tab_marl.evaluation.errors import Interrupted, UserError, require_known
+from tab_marl.evaluation.adversaries import opponent, population
+from tab_marl.evaluation.engines.local import stop_requested
+from tab_marl.evaluation.errors import Interrupted
 from tab_marl.evaluation.report.replay import Trace, shrink
 from tab_marl.evaluation.rows import EpisodeRow, Timing
-from tab_marl.evaluation.engines.local import stop_requested
 from tab_marl.evaluation.units import Job, unit_seeds
 from tab_marl.field.problem import FieldOptions
 from tab_marl.mission.tasks import Task, ego_can_be_first, sample_task
@@ -207,7 +206,10 @@ def play_unit(job: Job, trace: bool = False) -> list[Played]:
                     # The paper's reward knows no price of a completed mission.
                     free = replace(task.scenario, rewards=replace(task.scenario.rewards, mission_completed=0.0))
                     task = replace(task, scenario=free)
-            planner = make_planner(name, PlannerOptions(tab_field=FieldOptions.preset(job.planner_preset)))
+            options = PlannerOptions(
+                tab_field=FieldOptions.preset(job.planner_preset), rollouts=population(job.adversaries)
+            )
+            planner = make_planner(name, options)
             if job.learned is not None:
                 planner.restore(json.loads(job.learned))
             policy = opponent(job.adversary)
@@ -267,40 +269,3 @@ class WorkerLost(Exception):
 
 def _name_in_row(adversary: str) -> str:
     return adversary if os.sep not in adversary else Path(adversary).name
-
-
-SCRIPTED = "scripted"
-"""The route follower that nobody trained: may be asked for beside the zoo's policies."""
-
-
-@lru_cache(maxsize=64)
-def opponent(name: str) -> AdversaryPolicy:
-    """A shipped policy by name, `scripted`, or the policy in a folder. Raises UnknownName or PolicyError."""
-    return ScriptedAdversary() if name == SCRIPTED else find_policy(name)
-
-
-@lru_cache(maxsize=1)
-def zoo_names() -> tuple[str, ...]:
-    """Names of the shipped policies, sorted."""
-    return tuple(sorted(policy.name for policy in load_zoo()))
-
-
-def resolve_opponents(asked: Sequence[str]) -> dict[str, str]:
-    """What to call each opponent in a job -> digest of what it is; all shipped policies if none is asked for.
-
-    Shipped policies (whose files the code's fingerprint covers) go by name, others by the full path of their folder.
-    Raises UserError, UnknownName or PolicyError.
-    """
-    known = zoo_names()
-    if not asked:
-        if not known:
-            raise UserError("the zoo holds no adversary: train one with tab-marl train")
-        return dict.fromkeys(known, "")
-    found: dict[str, str] = {}
-    for name in asked:
-        if os.sep in name or (Path(name).is_dir() and name not in known):
-            policy = load_policy(name)
-            found[str(Path(name).resolve())] = policy.card.sha256[:16]
-        else:
-            found[require_known("adversary", (name,), (*known, SCRIPTED))[0]] = ""
-    return found

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 
 from rich.console import Console
@@ -39,10 +38,10 @@ class Experiment:
 
 def prepare(settings: EvaluationSettings) -> Experiment:
     """Resolve the adversaries and the code's fingerprint. Raises UserError for a policy that the zoo lacks."""
-    from tab_marl.evaluation.episode import resolve_opponents
+    from tab_marl.evaluation.adversaries import resolve_opponents
     from tab_marl.evaluation.settings import code_fingerprint
 
-    found = resolve_opponents(settings.adversaries)
+    found = resolve_opponents(settings.adversaries, settings.mix_splits)
     code = code_fingerprint()
     digests = [digest for digest in found.values() if digest]
     return Experiment(settings, tuple(found), "-".join([code, *digests]))
@@ -50,7 +49,7 @@ def prepare(settings: EvaluationSettings) -> Experiment:
 
 def zoo_checksums(adversaries: tuple[str, ...]) -> dict[str, str]:
     """Policy name -> SHA-256 of its weights; the scripted follower has none."""
-    from tab_marl.evaluation.episode import opponent
+    from tab_marl.evaluation.adversaries import opponent
     from tab_marl.evaluation.provenance import last_part
 
     cards = {last_part(name): getattr(opponent(name), "card", None) for name in adversaries}

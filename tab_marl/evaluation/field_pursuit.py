@@ -11,7 +11,8 @@ import numpy as np
 import pandas as pd
 
 from tab_marl.agents.planners import PlannerOptions, make_planner
-from tab_marl.evaluation.episode import WARM_STEPS, opponent, run_episode
+from tab_marl.evaluation.adversaries import opponent
+from tab_marl.evaluation.episode import WARM_STEPS, run_episode
 from tab_marl.evaluation.field_study import FIELDS
 from tab_marl.evaluation.units import Unit, unit_seeds
 from tab_marl.field import FieldOptions

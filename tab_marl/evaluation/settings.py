@@ -34,7 +34,9 @@ class EvaluationSettings:
     families: tuple[str, ...] = FAMILIES
     planners: tuple[str, ...] = PLANNERS
     adversaries: tuple[str, ...] = ()
-    """Zoo policies that take turns over the seeds; empty means every policy of the zoo."""
+    """Policies that take turns over the seeds: names, folders, or a split of the zoo; empty means the final split."""
+    mix_splits: bool = False
+    """Whether policies for development and those of the final table may stand in one table."""
     episodes: int = 150
     """Per mission, family and planner."""
     seed: int = 2025
@@ -86,6 +88,7 @@ class EvaluationSettings:
             "planner_preset": self.planner_preset,
             "adversaries": list(adversaries),
             "code": code,
+            **({"mix_splits": True} if self.mix_splits else {}),
         }
 
 

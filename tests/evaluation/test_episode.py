@@ -10,8 +10,9 @@ from tab_marl.agents.adversaries import ScriptedAdversary
 from tab_marl.agents.planners import make_planner
 from tab_marl.envs.intercept_v0 import parallel_env
 from tab_marl.evaluation import episode
+from tab_marl.evaluation.adversaries import SCRIPTED
 from tab_marl.evaluation.episode import play_unit, run_episode
-from tab_marl.evaluation.errors import Interrupted, UserError
+from tab_marl.evaluation.errors import Interrupted
 from tab_marl.evaluation.units import Job, Unit
 from tab_marl.mission import parse_mission
 from tab_marl.mission.tasks import Task
@@ -116,7 +117,7 @@ def test_the_environment_sees_the_same_starts_whoever_plans():
 
 
 def job(**changes):
-    base = Job(Unit("M1", "point", 0), ("random",), 11, None, (episode.SCRIPTED,), "default")
+    base = Job(Unit("M1", "point", 0), ("random",), 11, None, (SCRIPTED,), "default")
     return dataclasses.replace(base, **changes)
 
 
@@ -156,13 +157,3 @@ def test_nothing_learned_of_one_adversary_is_carried_to_the_next():
 def test_stopping_is_not_an_error():
     with pytest.raises(Interrupted):
         run_episode(lab_task(), Parked(), ScriptedAdversary(), 0, should_stop=lambda: True)
-
-
-def test_opponents(tmp_path):
-    shipped = episode.zoo_names()
-    assert tuple(episode.resolve_opponents(())) == shipped
-    assert list(episode.resolve_opponents((shipped[0].upper(), "scripted"))) == [shipped[0], "scripted"]
-    with pytest.raises(UserError, match="no adversary named 'nobody'"):
-        episode.resolve_opponents(("nobody",))
-    with pytest.raises(ValueError, match=r"card\.json"):
-        episode.resolve_opponents((str(tmp_path),))
