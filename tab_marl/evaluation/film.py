@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import shutil
-import subprocess
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tab_marl.evaluation.errors import UserError
+from tab_marl.field.answers.animation import FilmError, ffmpeg_program, write_gif, write_mp4
 
 Frame = NDArray[np.uint8]
 """``[height, width, 3]``."""
 
+COLOURS = 128
+"""Of an episode, as GIF."""
 KINDS = (".gif", ".mp4", ".png")
 
 
@@ -23,8 +24,10 @@ def check_target(path: Path) -> str:
     kind = path.suffix.casefold()
     if kind not in ("", *KINDS):
         raise UserError(f"{path}: cannot write {kind} films; end the name in .gif, .mp4 or .png (a picture per frame)")
-    if kind == ".mp4" and shutil.which("ffmpeg") is None:
-        raise UserError(f"{path}: MP4 needs the program ffmpeg, which is not installed; write a .gif instead")
+    if kind == ".mp4" and ffmpeg_program() is None:
+        raise UserError(
+            f"{path}: MP4 needs the program ffmpeg (pip install 'tab-marl[video]' brings one); write a .gif instead"
+        )
     try:
         (path if kind == "" else path.parent).mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -37,50 +40,14 @@ def write_film(frames: Iterable[Frame], path: Path, frames_per_second: int) -> i
     kind = check_target(path)
     try:
         if kind == ".gif":
-            return _gif(frames, path, frames_per_second)
+            return write_gif(frames, path, frames_per_second, COLOURS)
         if kind == ".mp4":
-            return _mp4(frames, path, frames_per_second)
+            return write_mp4(frames, path, frames_per_second)
         return _pngs(frames, path if kind == "" else path.with_suffix(""))
+    except FilmError as error:
+        raise UserError(str(error)) from None
     except OSError as error:
         raise UserError(f"{path}: cannot be written: {error.strerror or error}") from None
-
-
-def _gif(frames: Iterable[Frame], path: Path, frames_per_second: int) -> int:
-    from PIL import Image
-
-    pictures = [Image.fromarray(f).quantize(128, dither=Image.Dither.NONE) for f in frames]
-    if not pictures:
-        return 0
-    # The last picture stays for two seconds, so that the end can be read before the film starts again.
-    durations = [round(1000 / frames_per_second)] * (len(pictures) - 1) + [2000]
-    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=durations, loop=0)
-    return len(pictures)
-
-
-def _mp4(frames: Iterable[Frame], path: Path, frames_per_second: int) -> int:
-    iterator: Iterator[Frame] = iter(frames)
-    first = next(iterator, None)
-    if first is None:
-        return 0
-    height, width = first.shape[0] // 2 * 2, first.shape[1] // 2 * 2  # the codec wants even sides
-    command = [
-        "ffmpeg", "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}",
-        "-r", str(frames_per_second), "-i", "-", "-pix_fmt", "yuv420p", str(path),
-    ]  # fmt: skip
-    count = 0
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        assert process.stdin is not None and process.stderr is not None
-        try:
-            for frame in (first, *iterator):
-                process.stdin.write(np.ascontiguousarray(frame[:height, :width]).tobytes())
-                count += 1
-        except BrokenPipeError:
-            pass  # ffmpeg gave up; its own words say why
-        process.stdin.close()
-        message = process.stderr.read().decode(errors="replace").strip()
-    if process.returncode:
-        raise UserError(f"{path}: ffmpeg failed: {' '.join(message.split())}")
-    return count
 
 
 def _pngs(frames: Iterable[Frame], folder: Path) -> int:

@@ -31,12 +31,24 @@ def test_folder_of_pngs(tmp_path):
     assert (tmp_path / "b" / "frame-0003.png").exists()
 
 
+@pytest.mark.skipif(film.ffmpeg_program() is None, reason="no ffmpeg installed")
+def test_mp4_reads_back(tmp_path):
+    import imageio_ffmpeg
+
+    assert film.write_film(frames(), tmp_path / "a.mp4", 5) == 4
+    reader = imageio_ffmpeg.read_frames(str(tmp_path / "a.mp4"), pix_fmt="rgb24")
+    about = next(reader)
+    assert about["size"] == (30, 20) and about["fps"] == 5  # even sides
+    assert len(list(reader)) == 4
+    assert film.write_film(iter(()), tmp_path / "none.mp4", 5) == 0
+
+
 def test_unknown_kind_and_bad_places(tmp_path, monkeypatch):
     with pytest.raises(UserError, match=r"cannot write \.avi films"):
         film.check_target(tmp_path / "a.avi")
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot be written"):
         film.check_target(tmp_path / "file" / "a.gif")
-    monkeypatch.setattr(film.shutil, "which", lambda name: None)
+    monkeypatch.setattr(film, "ffmpeg_program", lambda: None)
     with pytest.raises(UserError, match="needs the program ffmpeg"):
         film.check_target(tmp_path / "a.mp4")

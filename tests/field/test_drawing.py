@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from tab_marl.field import FieldOptions, FieldProblem, TabField, solve
-from tab_marl.field.answers.animation import FilmError, _ffmpeg
+from tab_marl.field.answers.animation import FilmError, ffmpeg_program
 from tab_marl.field.answers.drawing import draw_posterior
 from tab_marl.field.answers.evidence import Seen, Unseen
 from tab_marl.mission import Constraint, Mission
@@ -55,7 +55,7 @@ def test_films(field, tmp_path):
     count = field.animate(tmp_path / "field.gif")
     with Image.open(tmp_path / "field.gif") as film:
         assert film.n_frames == count > 10
-    if _ffmpeg() is not None:
+    if ffmpeg_program() is not None:
         assert field.animate(tmp_path / "field.mp4") == count
         assert (tmp_path / "field.mp4").stat().st_size > 5000
         with pytest.raises(FilmError, match="ffmpeg could not write it"):
@@ -69,7 +69,7 @@ def test_films(field, tmp_path):
 def test_mp4_without_ffmpeg_says_what_to_do(field, tmp_path, monkeypatch):
     from tab_marl.field.answers import animation
 
-    monkeypatch.setattr(animation, "_ffmpeg", lambda: None)
+    monkeypatch.setattr(animation, "ffmpeg_program", lambda: None)
     with pytest.raises(FilmError, match=r"needs the program ffmpeg.*write a \.gif"):
         field.animate(tmp_path / "field.mp4")
 

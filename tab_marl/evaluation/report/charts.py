@@ -18,6 +18,8 @@ ROW = 21
 FOOT = 34
 TOP = 8
 RIGHT = 14
+MARKS = 4
+"""On each line of a plot of curves."""
 
 
 def css_name(planner: str) -> str:
@@ -36,18 +38,27 @@ class Dot:
 
 
 def interval_plot(
-    dots: Sequence[Dot], maximum: float, unit: str, title: str, scale: float = 1.0, digits: int = 1
+    dots: Sequence[Dot],
+    maximum: float,
+    unit: str,
+    title: str,
+    scale: float = 1.0,
+    digits: int = 1,
+    minimum: float = 0.0,
 ) -> str:
-    """Dots with 95 % intervals, one row per planner. `scale` turns the interval's numbers into the axis' ones."""
+    """Dots with 95 % intervals, one row per planner. `scale` turns the interval's numbers into the axis' ones.
+
+    What lies below the axis' `minimum` is written at its start.
+    """
     height = TOP + ROW * len(dots) + FOOT
     span = WIDTH - LABELS - RIGHT
 
     def x(value: float) -> float:
-        return LABELS + span * min(max(value / maximum, 0.0), 1.0)
+        return LABELS + span * min(max((value - minimum) / (maximum - minimum), 0.0), 1.0)
 
-    parts = [_open(WIDTH, height, title)]
+    parts = [_open(WIDTH, height, title, "chart dots")]
     bottom = TOP + ROW * len(dots)
-    for tick in ticks(maximum):
+    for tick in ticks(maximum, minimum):
         parts.append(
             f'<line class="grid" x1="{x(tick):.1f}" x2="{x(tick):.1f}" y1="{TOP}" y2="{bottom}"/>'
             f'<text class="tick" x="{x(tick):.1f}" y="{bottom + 14}" text-anchor="middle">{tick:g}</text>'
@@ -65,9 +76,13 @@ def interval_plot(
             f'<g class="{css_name(dot.planner)}"><title>{escape(note)}</title>'
             f'<rect class="hit" x="0" y="{y - ROW / 2:.1f}" width="{WIDTH}" height="{ROW}"/>'
             f'<text class="name" x="{LABELS - 8}" y="{y + 4:.1f}" text-anchor="end">{escape(short(dot.planner))}</text>'
-            f'<line class="whisker" x1="{x(low):.1f}" x2="{max(x(high), x(low) + 0.5):.1f}" y1="{y:.1f}" y2="{y:.1f}"/>'
-            f"{mark(dot.planner, x(value), y)}"
         )
+        parts.append(
+            f'<line class="whisker" x1="{x(low):.1f}" x2="{max(x(high), x(low) + 0.5):.1f}" y1="{y:.1f}" y2="{y:.1f}"/>'
+            if high >= minimum
+            else f'<text class="tick" x="{LABELS + 3}" y="{y + 4:.1f}">◂ {value:.{digits}f}</text>'
+        )
+        parts.append(mark(dot.planner, x(value), y) if value >= minimum else "")
         if dot.paper is not None:
             px = x(dot.paper)
             parts.append(f'<path class="paper" d="M{px - 4.5:.1f} {y:.1f}l4.5 -4.5 4.5 4.5 -4.5 4.5z"/>')
@@ -110,10 +125,17 @@ class Track:
 
 
 def curve_plot(
-    tracks: Sequence[Track], title: str, x_label: str, x_range: tuple[float, float], x_ticks: Sequence[float] = ()
+    tracks: Sequence[Track],
+    title: str,
+    x_label: str,
+    x_range: tuple[float, float],
+    x_ticks: Sequence[float] = (),
+    named: bool = True,
+    top_share: float = 1.0,
 ) -> str:
-    """Shares over x, one line per planner, named at its end; bands as pale areas."""
-    width, height, left, top, foot, right = 430, 250, 34, 10, 34, 78
+    """Shares over x, one line per planner with its marks, `named` at its end; bands as pale areas."""
+    width, height, left, top, foot = 360, 232, 32, 10, 34
+    right = 72 if named else 12
     w, h = width - left - right, height - top - foot
     start, end = x_range
 
@@ -121,14 +143,14 @@ def curve_plot(
         return left + w * np.clip((x - start) / (end - start), 0, 1)
 
     def down(share: NDArray[np.float64]) -> NDArray[np.float64]:
-        return top + h * (1 - np.clip(share, 0, 1))
+        return top + h * (1 - np.clip(share / top_share, 0, 1))
 
     parts = [_open(width, height, title)]
-    for share in (0.0, 0.25, 0.5, 0.75, 1.0):
-        y = top + h * (1 - share)
+    for share in np.linspace(0, top_share, 5):
+        y = float(down(share))
         parts.append(
             f'<line class="grid" x1="{left}" x2="{left + w}" y1="{y:.1f}" y2="{y:.1f}"/>'
-            f'<text class="tick" x="{left - 5}" y="{y + 4:.1f}" text-anchor="end">{100 * share:.0f}</text>'
+            f'<text class="tick" x="{left - 5}" y="{y + 4:.1f}" text-anchor="end">{100 * share:g}</text>'
         )
     for tick in x_ticks or ticks(end):
         x = left + w * (tick - start) / (end - start)
@@ -139,8 +161,8 @@ def curve_plot(
             x = across(np.concatenate([track.x, track.x[::-1]]))
             y = down(np.concatenate([track.high, track.low[::-1]]))
             parts.append(f'<g class="{css_name(track.planner)}"><polygon class="band" points="{_points(x, y)}"/></g>')
-    ends = spread_labels({t.planner: float(down(t.value)[-1]) for t in tracks}, 13, top + 4, top + h)
-    for track in tracks:
+    ends = spread_labels({t.planner: float(down(t.value)[-1]) for t in tracks}, 14, top + 4, top + h)
+    for number, track in enumerate(tracks):
         x, y = across(track.x), down(track.value)
         note = f"{track.planner}: {100 * track.value[-1]:.1f} % at the end"
         if track.low is not None and track.high is not None:
@@ -148,6 +170,14 @@ def curve_plot(
         parts.append(
             f'<g class="{css_name(track.planner)}"><title>{escape(note)}</title>'
             f'<polyline class="curve" points="{_points(x, y)}"/>'
+        )
+        # Marks at places of its own, so that lines that lie on each other can still be told apart, and without colour.
+        places = left + w * (np.arange(MARKS) + (number + 0.5) / len(tracks)) / MARKS
+        parts += [mark(track.planner, float(p), float(np.interp(p, x, y)), 2.8) for p in places]
+        if not named:
+            parts.append("</g>")
+            continue
+        parts.append(
             f'<path class="leader" d="M{left + w} {y[-1]:.1f}L{left + w + 9} {ends[track.planner]:.1f}"/>'
             f'<text class="name" x="{left + w + 12}" y="{ends[track.planner] + 4:.1f}">{escape(short(track.planner))}</text></g>'
         )
@@ -175,12 +205,13 @@ def spread_labels(wanted: Mapping[str, float], gap: float, low: float, high: flo
     return dict(zip(names, placed, strict=True))
 
 
-def ticks(maximum: float) -> list[float]:
-    """About five round values from 0 to the maximum."""
-    raw = maximum / 4
+def ticks(maximum: float, minimum: float = 0.0) -> list[float]:
+    """About five round values from the minimum to the maximum."""
+    raw = (maximum - minimum) / 4
     magnitude = 10.0 ** np.floor(np.log10(raw))
     step = min((m * magnitude for m in (1, 2, 2.5, 5, 10)), key=lambda s: abs(s - raw))
-    return [float(v) for v in np.arange(0, maximum + step * 1e-6, step)]
+    first = np.ceil(minimum / step - 1e-6) * step
+    return [float(v) + 0.0 for v in np.arange(first, maximum + step * 1e-6, step)]
 
 
 def short(planner: str) -> str:
@@ -188,5 +219,5 @@ def short(planner: str) -> str:
     return planner.removesuffix("-POMCP")
 
 
-def _open(width: int, height: int, title: str) -> str:
-    return f'<svg class="chart" viewBox="0 0 {width} {height}" role="img" aria-label="{escape(title)}">'
+def _open(width: int, height: int, title: str, name: str = "chart") -> str:
+    return f'<svg class="{name}" viewBox="0 0 {width} {height}" role="img" aria-label="{escape(title)}">'

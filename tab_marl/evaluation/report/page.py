@@ -138,18 +138,19 @@ def _family(name: str, found: Results) -> dict[str, Any]:
     means = found.restricted[found.restricted["family"] == name]
     missions = tables.order(means["mission"], MISSIONS)
     seconds = {(r.mission, r.planner): r for r in means.itertuples()}
+    until = {m: next(r.until_seconds for (k, _), r in seconds.items() if k == m) for m in missions}
     return {
         "name": name,
         "text": FAMILY_TEXT.get(name, ""),
         "lines": lines,
         "panels": panels.interval_panels(lines, name),
-        "completed": panels.curve_panels(found.completed, name, "Missions completed before interception"),
-        "met": panels.curve_panels(found.met, name, "Adversaries met"),
+        "completed": panels.curve_panels(found.completed, name, "Missions completed before interception", until),
+        "met": panels.curve_panels(found.met, name, "Adversaries met", until),
         "profile": panels.profile_plot(found.profiles, name),
         "middle": panels.middle_plot(found.aggregates, name),
         "middles": middles.to_dict("records"),
         "missions": missions,
-        "until": {m: next(r.until_seconds for (k, _), r in seconds.items() if k == m) for m in missions},
+        "until": until,
         "seconds": seconds,
         "planners": tables.order([x.planner for x in lines], PLANNERS),
         "comparisons": max((x.atcr_against_headline.comparisons for x in lines if x.atcr_against_headline and x.mission != ALL and x.planner in PAPER_PLANNERS), default=0),

@@ -17,6 +17,8 @@ from tab_marl.evaluation.statistics import Curve, Interval, bootstrap_mean
 from tab_marl.evaluation.statistics.frames import Key
 from tab_marl.evaluation.tables import ALL, Line, Share, order
 
+TOP_SHARES = (0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
+"""Where the axis of a plot of shares may end."""
 CURVE_POINTS = 121
 """Times at which a curve over time is drawn."""
 
@@ -45,21 +47,33 @@ def interval_panels(found: Sequence[Line], family: str) -> list[dict[str, Any]]:
     return panels
 
 
-def curve_panels(curves: Mapping[Key, Curve], family: str, title: str) -> list[dict[str, Any]]:
-    """Per mission, ALL first: shares over seconds with the bands of the planners that compete."""
+def curve_panels(
+    curves: Mapping[Key, Curve], family: str, title: str, until: Mapping[str, float]
+) -> list[dict[str, Any]]:
+    """Per mission, ALL first: shares over time with the bands of the planners that compete.
+
+    `until`: seconds shown of each mission; ALL has its time in percent of the episode's. Planners far above the others
+    would flatten them: they are left out of the picture and named in its `note`.
+    """
     panels = []
     missions = order([m for f, m, _ in curves if f == family], (ALL, *MISSIONS))
     for mission in missions:
         part = {p: c for (f, m, p), c in curves.items() if (f, m) == (family, mission)}
-        end = min(float(c.times[-1]) for c in part.values())
+        end, unit = (100.0, "% of the episode’s time") if mission == ALL else (until[mission], "seconds")
         grid = np.linspace(0, end, CURVE_POINTS)
         tracks = []
         for planner, curve in part.items():
             value, low, high = curve.at(grid)
             band = (low, high) if planner in PAPER_PLANNERS else (None, None)
             tracks.append(charts.Track(planner, grid, value, *band))
-        svg = charts.curve_plot(tracks, f"{title}, {mission_name(mission)}, {family}", "seconds", (0.0, end))
-        panels.append({"mission": mission_name(mission), "svg": Markup(svg)})
+        highest = [float(np.max(t.value if t.high is None else t.high)) for t in tracks if t.planner != "random"]
+        top = next(s for s in TOP_SHARES if s >= min(max(highest, default=1.0), 1.0))
+        beyond = [t for t in tracks if np.max(t.value) > top]
+        note = "; ".join(f"{t.planner}: {100 * t.value[-1]:.0f} % at the end, beyond the scale" for t in beyond)
+        shown = [t for t in tracks if t not in beyond]
+        name = f"{title}, {mission_name(mission)}, {family}"
+        svg = charts.curve_plot(shown, name, unit, (0.0, end), top_share=top)
+        panels.append({"mission": mission_name(mission), "svg": Markup(svg), "note": note})
     return panels
 
 
@@ -72,7 +86,9 @@ def profile_plot(profiles: pd.DataFrame, family: str) -> Markup:
         band = (one["low"].to_numpy(), one["high"].to_numpy()) if planner in PAPER_PLANNERS else (None, None)
         tracks.append(charts.Track(planner, one["threshold"].to_numpy(), one["value"].to_numpy(), *band))
     ticks = (0.0, 0.25, 0.5, 0.75, 1.0)
-    return Markup(charts.curve_plot(tracks, f"Performance profile, {family}", "score τ", (0.0, 1.0), ticks))
+    return Markup(
+        charts.curve_plot(tracks, f"Performance profile, {family}", "score τ", (0.0, 1.0), ticks, named=False)
+    )
 
 
 def middle_plot(aggregates: pd.DataFrame, family: str) -> Markup:
@@ -80,7 +96,12 @@ def middle_plot(aggregates: pd.DataFrame, family: str) -> Markup:
     part = aggregates[aggregates["family"] == family]
     dots = [charts.Dot(r.planner, Interval(r.iqm, r.low, r.high, r.episodes)) for r in part.itertuples()]
     title = f"Interquartile mean of the score, {family}"
-    return Markup(charts.interval_plot(dots, 1.0, "IQM of the score (higher is better)", title, digits=3))
+    # The planners that compete lie close together: the axis shows them, and says of others where they are.
+    close = [d.interval for d in dots if d.planner in PAPER_PLANNERS] or [d.interval for d in dots]
+    low = max(np.floor(20 * min(i.low for i in close) - 0.5) / 20, 0.0)
+    high = min(np.ceil(20 * max(d.interval.high for d in dots) + 0.5) / 20, 1.0)
+    unit = "IQM of the score (higher is better)"
+    return Markup(charts.interval_plot(dots, high, unit, title, digits=3, minimum=low))
 
 
 def pace_plot(timings: Mapping[tuple[str, str, str, int], Timing]) -> Markup:

@@ -81,7 +81,7 @@ def _group(choice: Choice, part: Sequence[tuple[Job, Played]], rows: Mapping[Any
             }
         )
     return {
-        "title": f"{unit.mission}, {unit.family}",
+        "title": f"{unit.mission}, {unit.family}, episode {unit.seed}",
         "about": f"“{text}” Adversary: {job.adversary}. Episode {unit.seed}, slack {task.slack:.2f}.",
         "why": f"Chosen as {choice.why}.",
         "map": encode_map(task.scenario, goals, scene.avoided),

@@ -29,7 +29,7 @@ STEPS_PER_SECOND = 100
 SLACK_EDGES = (1.3, 1.6, 2.0)
 """Bounds between the bins of slack."""
 COMPLETED, MET, FAILED = 1, 2, 3
-"""Causes that end an episode's first phase (`first_event`)."""
+"""Causes that end the race between completion and interception (column `first_cause`)."""
 METRICS = ("ATCR", "StI")
 NEEDED = ("mission", "family", "planner", "seed", "intercepted", "completed", "physics_steps", "horizon_steps")
 CURVE_POINTS = 121
@@ -182,23 +182,22 @@ def survival_curves(table: pd.DataFrame, event: str = "completed") -> dict[Key, 
     """(family, mission, planner) -> the share of episodes over seconds in which the mission was "completed" before
     interception (failure and interception competing), or in which the adversary was "met" (censored at the horizon).
 
-    ALL is the mean of the missions' curves, up to the shortest of their longest horizons.
+    ALL is the mean of the missions' curves over time in percent of each episode's own horizon.
     """
     if event not in ("completed", "met"):
         raise ValueError(f"event is {event!r}, must be 'completed' or 'met'")
     found: dict[Key, Curve] = {}
     for family, mission, parts in cells(table):
         for planner, part in parts.items():
+            steps, cause = ("first_steps", "first_cause") if event == "completed" else ("sti", "met")
             if mission == ALL:
-                several = [found[family, m, planner] for m in order(part["mission"], MISSIONS)]
-                end = min(float(c.times[-1]) for c in several)
-                found[family, mission, planner] = mean_curve(several, np.linspace(0, end, 2 * CURVE_POINTS))
-            elif event == "completed":
-                seconds = part["first_steps"].to_numpy() / STEPS_PER_SECOND
-                found[family, mission, planner] = cumulative_incidence(seconds, part["first_cause"], COMPLETED)
+                several = [
+                    cumulative_incidence(100 * one[steps] / one["horizon"], one[cause])
+                    for _, one in part.groupby("mission")
+                ]
+                found[family, mission, planner] = mean_curve(several, np.linspace(0, 100, CURVE_POINTS))
             else:
-                seconds = part["sti"].to_numpy() / STEPS_PER_SECOND
-                found[family, mission, planner] = cumulative_incidence(seconds, part["met"])
+                found[family, mission, planner] = cumulative_incidence(part[steps] / STEPS_PER_SECOND, part[cause])
     return found
 
 
