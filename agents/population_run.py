@@ -20,13 +20,15 @@ from tab_marl.agents.population import Population
 from tab_marl.agents.training_algorithms import ALGORITHMS
 from tab_marl.agents.training_settings import UNOPPOSED, TrainingError, TrainingSettings
 
-WAITING, TASKS, TRAINING, DONE, FAILED = "waiting", "tasks", "training", "done", "failed"
+WAITING, TASKS, TRAINING, HABITS, DONE, FAILED = "waiting", "tasks", "training", "habits", "done", "failed"
 ERROR_FILE = "error.txt"
 """In a member's folder: the traceback of what ended it."""
 START_SECONDS = 20.0
 """CPU seconds before a member's first step (imports, tasks), for the estimate of what is left."""
 HUNTED_FACTOR = 20.0
 """A guess of how much longer a hunted member's step takes, until one has been seen."""
+EPISODE_SECONDS = 3.0
+"""CPU seconds of an episode in which a planner hunts."""
 POLL_SECONDS = 1.0
 _ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -42,6 +44,8 @@ class MemberStand:
     cpu_seconds: float = 0.0
     steps_per_second: float = 0.0
     success: dict[str, float] | None = None
+    habit_share: float = 0.0
+    """Of the hunted episodes in which habits are learned."""
     error: str = ""
     """One line, if it failed."""
 
@@ -121,7 +125,9 @@ def _work(settings: TrainingSettings, folder: Path, command: str, send: Connecti
     from tab_marl.agents.zoo import export_policy
 
     def tell(stand: Progress) -> None:
-        if stand.phase != "tasks":
+        if stand.phase == HABITS:
+            send.send({"status": HABITS, "habit_share": stand.done / stand.total})
+        elif stand.phase == TRAINING:
             send.send(
                 {
                     "status": TRAINING,
@@ -133,10 +139,9 @@ def _work(settings: TrainingSettings, folder: Path, command: str, send: Connecti
             )
 
     try:
-        model = train(settings, folder, tell)
-        export_policy(model, settings, folder, command)
+        export_policy(train(settings, folder, tell), settings, folder, command)
         (folder / ERROR_FILE).unlink(missing_ok=True)
-        send.send({"status": DONE, "steps": int(model.num_timesteps), "cpu_seconds": _logged_seconds(folder)})
+        send.send({"status": DONE, "cpu_seconds": _logged_seconds(folder)})
     except KeyboardInterrupt:
         pass  # the parent was told, too
     except BrokenPipeError:
@@ -189,9 +194,21 @@ def _logged_seconds(folder: Path) -> float:
 
 def expected_seconds(settings: TrainingSettings) -> float:
     """A guess of the CPU seconds that a member takes from its beginning to its end."""
-    per_kilostep = ALGORITHMS[settings.algorithm].seconds_per_kilostep
-    factor = 1.0 if settings.opponent == UNOPPOSED else HUNTED_FACTOR
-    return START_SECONDS + per_kilostep * factor * settings.steps / 1000.0
+    return _training_seconds(settings) + EPISODE_SECONDS * settings.hunted_episodes
+
+
+def _training_seconds(settings: TrainingSettings) -> float:
+    factor = HUNTED_FACTOR if (settings.opponent != UNOPPOSED) else 1.0
+    return START_SECONDS + ALGORITHMS[settings.algorithm].seconds_per_kilostep * factor * settings.steps / 1000.0
+
+
+def share_done(stand: MemberStand) -> float:
+    """Of a member's expected work."""
+    if stand.ended:
+        return 1.0
+    whole = expected_seconds(stand.settings)
+    habits = EPISODE_SECONDS * stand.settings.hunted_episodes
+    return ((whole - habits) * stand.steps / stand.settings.steps + habits * stand.habit_share) / whole
 
 
 def seconds_left(stands: Stands, workers: int) -> float:
@@ -200,18 +217,19 @@ def seconds_left(stands: Stands, workers: int) -> float:
     for stand in stands.values():
         if stand.ended:
             continue
+        habits = EPISODE_SECONDS * stand.settings.hunted_episodes * (1.0 - stand.habit_share)
         if stand.steps_per_second > 0:
-            left.append((stand.settings.steps - stand.steps) / stand.steps_per_second)
+            left.append((stand.settings.steps - stand.steps) / stand.steps_per_second + habits)
         else:
-            left.append(expected_seconds(stand.settings) * _slowness(stand.settings, stands))
+            left.append(_training_seconds(stand.settings) * _slowness(stand.settings, stands) + habits)
     busy = min(workers, max(len(left), 1))
     return max(sum(left) / busy, max(left, default=0.0))
 
 
 def _slowness(settings: TrainingSettings, stands: Stands) -> float:
-    """Seconds taken over seconds expected, of members of the same kind, or of all that have run."""
-    hunted = settings.opponent != UNOPPOSED
+    """Seconds taken over seconds expected, of members of the same kind that have run."""
     seen = [s for s in stands.values() if s.cpu_seconds > 0 and s.steps > 0]
+    hunted = settings.opponent != UNOPPOSED
     alike = [s for s in seen if (s.settings.opponent != UNOPPOSED) == hunted]
-    pairs = [(s.cpu_seconds, expected_seconds(replace(s.settings, steps=s.steps))) for s in alike]
+    pairs = [(s.cpu_seconds, _training_seconds(replace(s.settings, steps=s.steps))) for s in alike]
     return sum(took for took, _ in pairs) / sum(expected for _, expected in pairs) if pairs else 1.0

@@ -27,6 +27,7 @@ from tab_marl.agents.training_hyperparameters import HyperparameterError, argume
 from tab_marl.agents.training_initial import begin_with
 from tab_marl.agents.training_log import LOG_FILE, ROWS, LearningLog
 from tab_marl.agents.training_settings import UNOPPOSED, TrainingError, TrainingSettings
+from tab_marl.mission.tasks import Task
 
 __all__ = ["CHECKPOINT_FILE", "LOG_FILE", "LOG_FOLDER", "SETTINGS_FILE", "OnProgress", "Progress", "train"]
 
@@ -42,9 +43,9 @@ class Progress:
     """Where a run stands; given to the progress callback after every row of the log and while the tasks are built."""
 
     phase: str
-    """ "tasks" while the bank is built, then "training"."""
+    """ "tasks" while the bank is built, then "training", then "habits" where those are learned."""
     done: int
-    """Tasks, or control steps."""
+    """Tasks, control steps, or rounds of hunted episodes."""
     total: int
     steps_per_second: float
     """Learning included, since this process began or continued the run; 0 while building."""
@@ -143,12 +144,18 @@ def _environment(settings: TrainingSettings, on_progress: OnProgress | None) -> 
         from tab_marl.agents.hunted_env import hunted_env
 
         return hunted_env(settings, built)
-    tasks = draw_tasks(
-        TRAINING, settings.seed, settings.tasks, settings.missions, settings.families, settings.map, settings.difficulty
-    )
+    tasks = training_tasks(settings)
     bank = build_bank(tasks, settings.style, settings.seed, built)
     kinds = [task.mission_id for task in tasks]
     return BatchedVecEnv(bank, kinds, settings.robots, settings.seed, settings.ego_seen_metres)
+
+
+def training_tasks(settings: TrainingSettings) -> list[Task]:
+    """The tasks that a run with these settings trains on."""
+    return draw_tasks(
+        TRAINING, settings.seed, settings.tasks, settings.missions, settings.families, settings.map, settings.difficulty,
+        settings.compositions,
+    )  # fmt: skip
 
 
 def build_model(settings: TrainingSettings, env: Any) -> BaseAlgorithm:

@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from tab_marl.envs.adversary_observation import AdversaryTask, observation_bounds
 from tab_marl.envs.batched import Bank, BatchedWorld
 from tab_marl.envs.styles import Style
+from tab_marl.mission.compositions import sample_composition
 from tab_marl.mission.curriculum import Curriculum
 from tab_marl.mission.tasks import Task, sample_task
 from tab_marl.world.sampling import MapOptions
@@ -31,22 +32,29 @@ def draw_tasks(
     families: Sequence[str],
     options: MapOptions | None = None,
     difficulty: tuple[float, float] | None = None,
+    compositions: Sequence[str] = (),
 ) -> list[Task]:
-    """`count` tasks, missions and families in turn; task i depends on (stream, seed, i) only.
+    """`count` tasks, missions and families in turn, then compositions; task i depends on (stream, seed, i) only.
 
-    options: of the maps. difficulty: the range in which the curriculum draws each task; see `difficulties`.
+    options: of the maps. compositions: names of `mission.compositions`, as many tasks each as of a mission and family.
+    difficulty: the range in which the curriculum draws each task; see `difficulties`.
     """
-    kinds = [(mission, family) for family in families for mission in missions]
-    generators = [np.random.default_rng((stream, seed, i)) for i in range(count)]
-    turn = [kinds[i % len(kinds)] for i in range(count)]
-    if difficulty is None:
-        return [sample_task(rng, *kind, options=options) for rng, kind in zip(generators, turn, strict=True)]
-    hardness = difficulties(stream, seed, count, difficulty)
+    kinds: list[tuple[str, ...]] = [(mission, family) for family in families for mission in missions]
+    kinds += [(composition,) for composition in compositions]
+    hardness = [0.0] * count if difficulty is None else difficulties(stream, seed, count, difficulty)
     curriculum = Curriculum()
-    return [
-        curriculum.sample_task(rng, hard, *kind)
-        for rng, hard, kind in zip(generators, hardness, turn, strict=True)
-    ]  # fmt: skip
+
+    def draw(i: int) -> Task:
+        rng, kind = np.random.default_rng((stream, seed, i)), kinds[i % len(kinds)]
+        if len(kind) == 1:
+            return sample_composition(
+                rng, kind[0], options=curriculum.map_options(hardness[i]) if difficulty else options
+            )
+        if difficulty is None:
+            return sample_task(rng, *kind, options=options)
+        return curriculum.sample_task(rng, hardness[i], *kind)
+
+    return [draw(i) for i in range(count)]
 
 
 def difficulties(stream: int, seed: int, count: int, bounds: tuple[float, float]) -> list[float]:

@@ -28,6 +28,7 @@ from tab_marl.agents.training_hyperparameters import (
     write_policy_kwargs,
 )
 from tab_marl.envs.styles import STYLES, Style
+from tab_marl.mission.compositions import COMPOSITIONS
 from tab_marl.mission.tasks import FAMILIES, MISSION_IDS
 from tab_marl.world.sampling import MapOptions
 from tab_marl.world.scenario import STRICT, UnknownName
@@ -53,7 +54,7 @@ class TrainingSettings:
     algorithm: str = "ppo"
     """A name of `ALGORITHMS`, which are rl-baselines3-zoo's."""
     opponent: str = UNOPPOSED
-    """Who hunts it: "none", "pursue", a policy of the ego side (a folder or a zip), or a planner such as "TAB-POMCP"."""
+    """Who hunts it: "none", "pursue", an SB3 ego's .zip, a planner such as "TAB-POMCP", or several joined by "+"."""
     habits_against: str = ""
     """Egos against which the weights of the style's mixture are learned when the policy is trained ("FP-POMCP+TAB-POMCP": one
     of them per episode; population-POMCP knows the present mixture); "": the weights stay."""
@@ -64,6 +65,8 @@ class TrainingSettings:
     split: str = SPLITS[0]
     missions: tuple[str, ...] = MISSION_IDS
     families: tuple[str, ...] = ("point", "ambiguous", "perimeter")
+    compositions: tuple[str, ...] = ()
+    """Missions composed otherwise than M1 to M5 (`mission.compositions`) that are trained on, too; the rest is held out."""
     map: MapOptions | None = None
     """How the maps are drawn; None: as tasks are drawn everywhere else."""
     difficulty: tuple[float, float] | None = None
@@ -97,7 +100,7 @@ class TrainingSettings:
     __pydantic_config__: ClassVar = STRICT
 
     def __post_init__(self) -> None:
-        for name in ("missions", "families", "layers"):
+        for name in ("missions", "families", "compositions", "layers"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         for mission in self.missions:
             if mission not in MISSION_IDS:
@@ -105,6 +108,9 @@ class TrainingSettings:
         for family in self.families:
             if family not in FAMILIES:
                 raise UnknownName("scenario family", family, FAMILIES)
+        for composition in self.compositions:
+            if composition not in COMPOSITIONS:
+                raise UnknownName("composition", composition, COMPOSITIONS)
         if self.algorithm not in ALGORITHMS:
             raise UnknownName("algorithm", self.algorithm, ALGORITHMS)
         if self.split not in SPLITS:
@@ -189,6 +195,11 @@ class TrainingSettings:
     def environment(self) -> str:
         """The environment id under which its packaged hyperparameters stand."""
         return BATCHED_MISSIONS if self.opponent == UNOPPOSED else HUNTED_MISSIONS
+
+    @property
+    def hunted_episodes(self) -> int:
+        """Episodes against live egos after the networks have learned."""
+        return self.habit_episodes if self.habits_against else 0
 
     @property
     def final_step(self) -> float:

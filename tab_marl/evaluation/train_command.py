@@ -56,6 +56,9 @@ def train_one(
                 bar.update(tasks, completed=stand.done, total=stand.total)
                 return
             bar.start_task(steps)
+            if stand.phase == "habits":
+                bar.update(steps, completed=settings.steps, note=f"hunted, round {stand.done} of {stand.total}")
+                return
             bar.update(
                 steps, completed=stand.done, note=f"{stand.steps_per_second:.0f} steps/s  {shares(stand.success)}"
             )
@@ -132,11 +135,11 @@ class _Lines:
     def __exit__(self, *ending: object) -> None: ...
 
     def __call__(self, stand: MemberStand, stands: dict[str, MemberStand]) -> None:
-        from tab_marl.agents.population_run import FAILED, TRAINING, seconds_left
+        from tab_marl.agents.population_run import FAILED, HABITS, TRAINING, seconds_left, share_done
 
         ended = sum(s.ended for s in stands.values())
-        tenth = TENTHS * stand.steps // stand.settings.steps
-        if stand.status == TRAINING and tenth == self._tenths.get(stand.name, 0):
+        tenth = int(TENTHS * share_done(stand))
+        if stand.status in (TRAINING, HABITS) and tenth == self._tenths.get(stand.name, 0):
             return
         self._tenths[stand.name] = tenth
         said = stand.error if stand.status == FAILED else shares(stand.success)
@@ -168,7 +171,7 @@ class _Bars:
         self._progress.stop()
 
     def __call__(self, stand: MemberStand, stands: dict[str, MemberStand]) -> None:
-        from tab_marl.agents.population_run import DONE, FAILED, expected_seconds, seconds_left
+        from tab_marl.agents.population_run import DONE, FAILED, expected_seconds, seconds_left, share_done
 
         if stand.ended:
             bar = self._bars.pop(stand.name, None)
@@ -183,7 +186,7 @@ class _Bars:
                 self._bars[stand.name], completed=stand.steps, note=f"{stand.status}  {shares(stand.success)}"
             )
         weight = {name: expected_seconds(s.settings) for name, s in stands.items()}
-        done = sum(weight[n] * (1.0 if s.ended else s.steps / s.settings.steps) for n, s in stands.items())
+        done = sum(weight[name] * share_done(s) for name, s in stands.items())
         ended = sum(s.ended for s in stands.values())
         failed = sum(s.status == FAILED for s in stands.values())
         self._progress.update(
