@@ -63,7 +63,12 @@ def now() -> str:
 
 
 def begin_run(connection: sqlite3.Connection, key: str, record: Mapping[str, Any]) -> int:
-    """Insert a run of this process; returns its number."""
+    """Insert a run of this process and drop the claims of dead ones; returns its number."""
+    for run, *owner in connection.execute(
+        "SELECT run, machine, process, alive_until FROM runs WHERE run IN (SELECT run FROM claims)"
+    ).fetchall():
+        if not lives(*owner):
+            connection.execute("DELETE FROM claims WHERE run = ?", (run,))
     made = connection.execute(
         "INSERT INTO runs (settings_key, started, record, machine, process, alive_until) VALUES (?, ?, ?, ?, ?, ?)",
         (key, now(), json.dumps(record, sort_keys=True), this_machine(), os.getpid(), time.time() + LEASE_SECONDS),

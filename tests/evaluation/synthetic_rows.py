@@ -97,20 +97,26 @@ def play_and_always_break(job: Job):
 def play_noting(job: Job):
     """Each episode leaves a line: to see how often it was played, and by whom."""
     with Path(os.environ["SYNTHETIC_MARKER"]).open("a") as log:
-        for planner in job.planners:
-            log.write(f"{job.unit.mission} {job.unit.family} {planner} {job.unit.seed} {os.getppid()}\n")
+        log.writelines(f"{job.unit.mission} {job.unit.family} {planner} {job.unit.seed} {os.getppid()}\n" for planner in job.planners)
     return play_slowly(job)
 
 
 def evaluate_folder(folder: str, episodes: str, workers: str, play: str = "play_slowly") -> None:
     """A whole evaluation with synthetic episodes, to be run, and killed, as a process of its own."""
     import synthetic_rows
+
     from tab_marl.evaluation.engines.local import LocalEngine
     from tab_marl.evaluation.runner import run
     from tab_marl.evaluation.settings import EvaluationSettings, settings_key
     from tab_marl.evaluation.store import Store
 
-    settings = EvaluationSettings(("M1", "M3"), ("point",), ("S-POMCP", "MLE-POMCP", "TAB-POMCP"), (), int(episodes), 7)
+    settings = EvaluationSettings(
+        missions=("M1", "M3"),
+        families=("point",),
+        planners=("S-POMCP", "MLE-POMCP", "TAB-POMCP"),
+        episodes=int(episodes),
+        seed=7,
+    )
     with Store.create(Path(folder)) as store:
         content = settings.content("code", ("a", "b"))
         key = settings_key(content)
