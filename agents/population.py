@@ -29,7 +29,7 @@ from tab_marl.world.scenario import UnknownName
 
 FOLDER = Path(__file__).parent / "populations"
 """The populations that ship; they are found by their names."""
-KEYS = ("name", "defaults", "member")
+KEYS = ("name", "controls", "defaults", "member")
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,8 @@ class Population:
     members: tuple[TrainingSettings, ...]
     source: str
     """The file, as it was given."""
+    controls: tuple[str, ...] = ()
+    """Members that are trained for comparison only: a style counts if its own figure moves against them."""
 
     @classmethod
     def load(cls, file: Path | str) -> Population:
@@ -75,7 +77,13 @@ class Population:
                     f"{source}: policies {seen[member.name]} and {number} are both named {member.name!r}: names are folders"
                 )
             seen[member.name] = number
-        return cls(str(data.get("name", name)), tuple(members), source)
+        controls = data.get("controls", [])
+        if not isinstance(controls, list):
+            raise TrainingError(f"{source}: controls is {controls!r}, must be a list of names of members")
+        for control in controls:
+            if control not in seen:
+                raise TrainingError(f"{source}: controls: {UnknownName('member', str(control), seen)}")
+        return cls(str(data.get("name", name)), tuple(members), source, tuple(controls))
 
     def only(self, names: Sequence[str]) -> Population:
         """These members alone. Raises TrainingError for a name that is not among them."""

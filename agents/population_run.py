@@ -27,7 +27,7 @@ START_SECONDS = 20.0
 """CPU seconds before a member's first step (imports, tasks), for the estimate of what is left."""
 HUNTED_FACTOR = 20.0
 """A guess of how much longer a hunted member's step takes, until one has been seen."""
-EPISODE_SECONDS = 3.0
+EPISODE_SECONDS = 1.5
 """CPU seconds of an episode in which a planner hunts."""
 POLL_SECONDS = 1.0
 _ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")

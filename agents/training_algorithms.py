@@ -26,9 +26,9 @@ class Algorithm:
 
 ALGORITHMS: dict[str, Algorithm] = {
     "ppo": Algorithm("PPO", "stable_baselines3", True, 0.12),
-    "a2c": Algorithm("A2C", "stable_baselines3", True, 0.09),
-    "sac": Algorithm("SAC", "stable_baselines3", False, 0.4),
-    "td3": Algorithm("TD3", "stable_baselines3", False, 0.3),
+    "a2c": Algorithm("A2C", "stable_baselines3", True, 0.05),
+    "sac": Algorithm("SAC", "stable_baselines3", False, 0.3),
+    "td3": Algorithm("TD3", "stable_baselines3", False, 0.2),
     "tqc": Algorithm("TQC", "sb3_contrib", False, 0.6),
-    "ppo_lstm": Algorithm("RecurrentPPO", "sb3_contrib", True, 0.4),
+    "ppo_lstm": Algorithm("RecurrentPPO", "sb3_contrib", True, 0.17),
 }
