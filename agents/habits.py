@@ -41,7 +41,7 @@ OWN_ROLLOUTS = 3
 """Trajectories per task and habit that population-POMCP knows."""
 POOL = 60
 """Trajectories in its belief, drawn by the present mixture."""
-TASKS = 40
+TASKS = 30
 """Tasks on which a training run learns its habits: their fields are solved once and kept."""
 
 
@@ -199,14 +199,15 @@ def learn_habits(
 def learn_for(
     settings: TrainingSettings, model: Any, folder: Path, on_round: Callable[[int, int], None] | None = None
 ) -> Style:
-    """`learn_habits` of a training run, with the actor of its model, on the first tasks of its bank.
+    """`learn_habits` of a training run, with the actor of its model, on tasks of its own.
 
-    Families of one small goal are left out where there are others: whoever waits there wins, whatever the adversary does.
+    Where the settings have a family whose last goal is any of several places, its tasks alone: at a single goal a planner
+    waits, whatever the adversary does, and there is nothing to learn. The weights for such missions then stay even.
     Raises TrainingError.
     """
     from tab_marl.agents.zoo import policy_of
 
-    families = tuple(family for family in settings.families if family != "point") or settings.families
+    families = tuple(family for family in settings.families if family == "ambiguous") or settings.families
     tasks = draw_tasks(
         TRAINING,
         settings.seed,

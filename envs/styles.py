@@ -186,10 +186,10 @@ STYLES["habits"] = mixture_of(
     (
         *(STYLES[name] for name in ("direct", "side", "via", "camera-shy", "late", "wander", "fickle")),
         Style("fickle-via", via=1.0, order_metres=6.0),
-        Style("fickle-late", arrival_fraction=(0.75, 0.9), order_metres=6.0),
+        Style("roundabout", via=1.0, via_points_max=2),
         Style("fickle-shy", camera_shy=6.0, order_metres=6.0),
         Style("fickle-side", side=1.0, order_metres=6.0),
-        Style("shy-late", camera_shy=6.0, arrival_fraction=(0.75, 0.9), order_metres=6.0),
+        Style("shy-via", camera_shy=6.0, via=1.0),
     ),
 )
 
