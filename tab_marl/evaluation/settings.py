@@ -163,7 +163,8 @@ def code_fingerprint() -> str:
                 digest.update(_meaning(path))
             elif path.suffix in (".lark", ".safetensors", ".json") and path.is_file():
                 digest.update(path.name.encode() + path.read_bytes())
-    digest.update(_meaning(Path(__file__).parent / "episode.py"))
+    for name in ("episode.py", "adversaries.py", "units.py"):
+        digest.update(_meaning(Path(__file__).parent / name))
     return digest.hexdigest()
 
 
