@@ -121,12 +121,17 @@ def evaluate(
 def report(
     out: Out = Path("runs/evaluation"),
     key: Annotated[str | None, typer.Option("--settings", help="Settings key, if the folder holds several.")] = None,
-    replays: Annotated[int | None, typer.Option(help="Animated replays; default: as evaluated.")] = None,
+    replays: Annotated[int | None, typer.Option(min=0, max=30, help="Animated replays; default: as evaluated.")] = None,
+    tables: Annotated[str | None, typer.Option(help="Also tables for papers, in OUT/tables: md, tex.")] = None,
+    figures: Annotated[str | None, typer.Option(help="Also figures, in OUT/figures: svg, pdf, png.")] = None,
+    films: Annotated[str | None, typer.Option(help="Also a film of every replay, in OUT/films: gif, mp4.")] = None,
 ) -> None:
-    """Print the tables of stored episodes again and rewrite their report."""
+    """Print the tables of stored episodes again and rewrite their report; also tables, figures and films for papers."""
     from tab_marl.evaluation.console import notes_console
-    from tab_marl.evaluation.report.present import present
+    from tab_marl.evaluation.report.present import Wanted, present
     from tab_marl.evaluation.store import Store
+
+    wanted = Wanted(_names(tables) or (), _names(figures) or (), _names(films) or ())
 
     notes = notes_console()
     with Store.open(out) as store:
@@ -140,7 +145,7 @@ def report(
             notes.print(
                 f"settings {known[0].key}, the latest of {len(known)}; --settings chooses another", highlight=False
             )
-        present(store, matching[0], store.path.parent, replays, notes)
+        present(store, matching[0], store.path.parent, replays, notes, wanted)
 
 
 @app.command()

@@ -35,6 +35,11 @@ COLOURS = {
 """The page's, light."""
 
 
+def check_kind(folder: Path, kind: str) -> None:
+    """Raise UserError unless a film of this kind can be written there; before any episode is played."""
+    check_target(folder / f"film.{kind}")
+
+
 def export_films(groups: Sequence[Mapping[str, Any]], folder: Path, kind: str) -> list[Path]:
     """A film ("gif" or "mp4") of every replay; returns the files. Raises UserError before drawing if it cannot be made."""
     written = []

@@ -84,6 +84,7 @@ def render(data: ReportData, results: Results | None = None) -> str:
     broken = found.table[found.table["broken"]]
     errors = broken[["mission", "family", "planner", "seed", "error"]].to_dict("records")
     keys = [(r["mission"], r["family"], r["planner"], r["seed"]) for r in errors]
+    paces = tables.paces(data.timings)
     traces = {t for key in keys if (t := data.timings[key].traceback if key in data.timings else None)}
     return environment.from_string(_template("report.html.j2")).render(
         css=Markup(_template("report.css")),
@@ -97,7 +98,8 @@ def render(data: ReportData, results: Results | None = None) -> str:
             for c, shares in found.by.items()
         ],
         first=panels.heat_map(found.first),
-        paces=tables.paces(dict(data.timings)),
+        paces=paces,
+        processor=any(pace.processor_milliseconds is not None for pace in paces),
         mission_paces=_mission_paces(data),
         pace_plot=panels.pace_plot(data.timings),
         paper=PAPER,

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from tab_marl.envs.mission_scene import mission_scene
+from tab_marl.evaluation.engines.local import pool
 from tab_marl.evaluation.episode import Played, play_unit
 from tab_marl.evaluation.report.replay import Choice, encode_image, encode_map, encode_trace, shrink
 from tab_marl.evaluation.rows import EpisodeRow
-from tab_marl.evaluation.runner import pool
 from tab_marl.evaluation.settings import LEARNS_ACROSS_EPISODES
 from tab_marl.evaluation.store import Store
 from tab_marl.evaluation.units import Job, unit_seeds

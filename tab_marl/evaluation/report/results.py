@@ -30,7 +30,7 @@ class ReportData:
     figures: Mapping[str, str] | None = None
     """SVG by name, as `explanation.explanation` makes them; None leaves the drawn explanation out."""
     cards: Sequence[Mapping[str, str]] = ()
-    """Adversaries: name, text, and style where it is known."""
+    """Adversaries: name, text, and style and split where they are known."""
     version: str = ""
     record: Mapping[str, Any] = field(default_factory=dict)
     """Of the run: versions, machine, configuration, checksums; nested mappings become tables of their own."""
@@ -57,6 +57,9 @@ def compute(data: ReportData) -> Results:
     """Every statistic of the rows. Raises UserError without rows."""
     styles = {card["name"]: card["style"] for card in data.cards if card.get("style")}
     table = frame(data.rows, styles)
+    splits = {card["name"]: card["split"] for card in data.cards if card.get("split")}
+    if "split" not in table and splits:
+        table["split"] = table["adversary"].map(splits)
     if not len(table):
         raise UserError("there are no episodes to report on")
     by = {}
