@@ -29,6 +29,6 @@ ALGORITHMS: dict[str, Algorithm] = {
     "a2c": Algorithm("A2C", "stable_baselines3", True, 0.05),
     "sac": Algorithm("SAC", "stable_baselines3", False, 0.3),
     "td3": Algorithm("TD3", "stable_baselines3", False, 0.2),
-    "tqc": Algorithm("TQC", "sb3_contrib", False, 0.6),
+    "tqc": Algorithm("TQC", "sb3_contrib", False, 0.38),
     "ppo_lstm": Algorithm("RecurrentPPO", "sb3_contrib", True, 0.17),
 }

@@ -149,7 +149,7 @@ def two(tmp_path_factory):
         written(
             folder,
             TINY
-            + "[[member]]\nname = 'steady'\n[[member]]\nname = 'doomed'\nseed = 5\nsteps = 16_000\ncheckpoint_seconds = 0.2\n",
+            + "[[member]]\nname = 'steady'\n[[member]]\nname = 'doomed'\nseed = 5\nsteps = 8_000\ncheckpoint_seconds = 0.05\n",
         )
     )
 
