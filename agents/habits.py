@@ -52,9 +52,9 @@ class HabitSettings:
     egos: tuple[str, ...] = ("FP-POMCP", "TAB-POMCP")
     """One is drawn per episode. population-POMCP knows the adversary's present mixture, and so punishes being predictable."""
     episodes: int = 1000
-    together: int = 24
+    together: int = 16
     """Episodes between two updates."""
-    step: float = 0.4
+    step: float = 0.8
     """The learning rate of the logarithms of the weights, per update."""
     explore: float = 0.25
     """So much of the trials is spread evenly over the habits."""

@@ -181,7 +181,7 @@ class HuntedVecEnv(VecEnv):
 
     def snapshot(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         """Everything that what follows depends on: arrays, and JSON values. Call it between steps."""
-        arrays = {
+        arrays: dict[str, NDArray[Any]] = {
             "task": self.arenas.task.copy(),
             "steps": self.arenas.steps,
             "hunter": self._hunter.copy(),
@@ -190,7 +190,7 @@ class HuntedVecEnv(VecEnv):
             "told": self._told[:, : int(self.arenas.steps.max()) + 1].copy(),
             "weights": self.weights.copy(),
         }
-        text = {
+        text: dict[str, Any] = {
             "random": self.rng.bit_generator.state,
             "recent": self.recent,
             "caught": self.recently_caught,
@@ -206,8 +206,8 @@ class HuntedVecEnv(VecEnv):
         self._told[:, : arrays["told"].shape[1]] = arrays["told"]
         self._learned = list(text["learned"])
         last = int(steps.max())
-        for i in range(self.num_envs):
-            self.hunters.leave(i)
+        for arena in range(self.num_envs):
+            self.hunters.leave(arena)
         for now in range(last + 1):
             # Each arena begins so late that all stand where they stood after the last round.
             which = np.flatnonzero(last - steps == now)

@@ -70,6 +70,6 @@ def play_hunted(
         end[ended] = len(path)
         path.append(np.where(going[:, None], arenas.robots[:, 1, :2], path[-1]).astype(np.float32))
         going &= ~ended
-        for i in np.flatnonzero(ended):
-            hunters.leave(int(i))
+        for arena in np.flatnonzero(ended).tolist():
+            hunters.leave(arena)
     return Hunted(completed, caught, end, np.stack(path, axis=1))

@@ -1,0 +1,138 @@
+"""What being hunted does to a policy: the share of missions completed against live egos on held-out tasks, under the habits
+that it learned, under even ones, and without any."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tab_marl.agents.habits import aware_task
+from tab_marl.agents.hunted_play import play_hunted
+from tab_marl.agents.planner_memory import PlannerMemory
+from tab_marl.agents.planners import PlannerOptions
+from tab_marl.agents.rollouts import run_bank
+from tab_marl.agents.training_env import HELD_OUT, build_bank, draw_tasks
+from tab_marl.agents.validation import WINDING_RADIANS, wilson
+from tab_marl.agents.zoo import ZooPolicy
+from tab_marl.envs.styles import STYLES, Style
+from tab_marl.mission.tasks import MISSION_IDS, Task
+
+BLOCK = 20
+"""Tasks played side by side, and whose fields are kept."""
+
+
+@dataclass(frozen=True)
+class HuntedRow:
+    """One hunted episode."""
+
+    policy: str
+    style: str
+    ego: str
+    mission: str
+    family: str
+    task: int
+    sees_ego: bool
+    completed: bool
+    caught: bool
+    seconds: float
+    """Until the mission was completed or failed, or the adversary was caught."""
+
+
+def styles_of(policy: ZooPolicy) -> dict[str, Style]:
+    """The policy's own style beside the even mixture of the same habits, and none at all."""
+    return {"learned": policy.style, "even": STYLES["habits"], "direct": STYLES["direct"]}
+
+
+def study(
+    policies: Mapping[str, tuple[ZooPolicy, Style]],
+    family: str,
+    count: int,
+    egos: Sequence[str],
+    seed: int,
+    seen_metres: float = 0.0,
+    options: PlannerOptions | None = None,
+    on_played: Callable[[int, int], None] | None = None,
+) -> list[HuntedRow]:
+    """Every policy against every ego on the same `count` held-out tasks of a family, missions in turn, from the same starts.
+
+    `policies`: by name, with the style to play in. `options`: the planners' (default: those of an evaluation).
+    """
+    tasks = draw_tasks(HELD_OUT, seed, count, MISSION_IDS, (family,))
+    rows: list[HuntedRow] = []
+    for first in range(0, count, BLOCK):
+        block = range(first, min(count, first + BLOCK))
+        hunting = replace(options or PlannerOptions(), memory=PlannerMemory())
+        for ego in egos:
+            for name, (policy, style) in policies.items():
+                built = [aware_task(tasks[i], style, np.random.default_rng((seed, i)), seen_metres) for i in block]
+                played = play_hunted(policy, built, [ego] * len(built), [seed * 10_000 + i for i in block], hunting)
+                rows += [
+                    HuntedRow(
+                        name, style.name, ego, tasks[i].mission_id, family, i, seen_metres > 0, bool(played.completed[j]),
+                        bool(played.caught[j]), float(played.end[j]) / tasks[i].scenario.control_hertz,
+                    )
+                    for j, i in enumerate(block)
+                ]  # fmt: skip
+        if on_played is not None:
+            on_played(block[-1] + 1, count)
+    return rows
+
+
+def shares(rows: Sequence[HuntedRow]) -> dict[tuple[str, str], tuple[int, int, float, float]]:
+    """(policy, ego) -> completed, episodes, and the 95 % Wilson interval of the share."""
+    found: dict[tuple[str, str], list[bool]] = {}
+    for row in rows:
+        found.setdefault((row.policy, row.ego), []).append(row.completed)
+    return {cell: (sum(done), len(done), *wilson(sum(done), len(done))) for cell, done in found.items()}
+
+
+def entropy_bits(style: Style, open_ended: bool = True) -> float:
+    """Of the mixture's weights."""
+    weights = style.weights(open_ended)
+    weights = weights[weights > 0]
+    return float(-(weights * np.log2(weights)).sum()) if len(weights) else 0.0
+
+
+@dataclass(frozen=True)
+class Unhunted:
+    """What a policy does on the same tasks when nobody hunts it."""
+
+    completed: float
+    same_side: float
+    """Share of completed episodes whose way turns about the arena's centre as the shortest one does, where that turns."""
+    same_last_goal: float
+    """Share of completed episodes that end at the same place as the shortest way."""
+    stretch: float
+    """Mean length over the shortest."""
+
+
+def unhunted(policy: ZooPolicy, style: Style, family: str, count: int, seed: int, draws: int = 3) -> Unhunted:
+    """`draws` unopposed episodes on each of the held-out tasks of `study`, beside the direct style's."""
+    tasks = draw_tasks(HELD_OUT, seed, count, MISSION_IDS, (family,))
+    shortest = build_bank(tasks, STYLES["direct"], seed)
+    plain = run_bank(policy, shortest, np.arange(count), np.random.default_rng(seed))
+    done, side, last, stretch = [], [], [], []
+    for draw in range(draws):
+        bank = build_bank(tasks, style, seed + draw)
+        ways = run_bank(policy, bank, np.arange(count), np.random.default_rng((seed, draw)))
+        done += ways.completed.tolist()
+        for i in np.flatnonzero(ways.completed & plain.completed):
+            path, other = (r.positions[i, : r.end[i] + 1].astype(np.float64) for r in (ways, plain))
+            turned, usual = _winding(path, tasks[i]), _winding(other, tasks[i])
+            if abs(usual) >= WINDING_RADIANS:
+                side.append(abs(turned) >= WINDING_RADIANS and np.sign(turned) == np.sign(usual))
+            last.append(ways.places[i][-1:] == plain.places[i][-1:])
+            stretch.append(_length(path) / _length(other))
+    return Unhunted(*(float(np.mean(values)) for values in (done, side, last, stretch)))
+
+
+def _winding(path: NDArray[np.float64], task: Task) -> float:
+    x, y = path.T - [[task.scenario.width_metres / 2], [task.scenario.height_metres / 2]]
+    return float(np.diff(np.unwrap(np.arctan2(y, x))).sum())
+
+
+def _length(path: NDArray[np.float64]) -> float:
+    return float(np.hypot(*np.diff(path, axis=0).T).sum())
