@@ -10,11 +10,16 @@ import shlex
 import signal
 import sys
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
 from tab_marl.evaluation.errors import UserError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from tab_marl.evaluation.store import Store, StoredSettings
 
 app = typer.Typer(
     name="tab-marl",
@@ -72,12 +77,20 @@ def evaluate(
         float | None, typer.Option(help="Allowed time over shortest time; default: drawn per task.")
     ] = None,
     workers: Annotated[int | None, typer.Option(help="Processes; default: one per core.")] = None,
+    engine: Annotated[str, typer.Option(help="What plays: local (processes of this machine) or ray.")] = "local",
+    address: Annotated[
+        str | None, typer.Option(help="With --engine ray: auto, ray://HOST:10001, or none for a Ray of its own.")
+    ] = None,
     replays: Annotated[int | None, typer.Option(help="Animated replays in the report.")] = None,
     out: Out = Path("runs/evaluation"),
     config: Annotated[Path | None, typer.Option(help="TOML file with these settings; options override it.")] = None,
     preset: Annotated[str | None, typer.Option(help="demo (minutes) or paper (150 episodes each).")] = None,
     zoo: UserZoo = None,
     retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Play again what is stored as failed.")] = False,
+    half_width: Annotated[
+        float, typer.Option(help="Print how many episodes bring an ATCR's interval down to +- this, in points.")
+    ] = 5.0,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print what a run would take, and stop.")] = False,
 ) -> None:
     """Play missions x families x planners against the zoo; print the tables and write an HTML report.
 
@@ -101,20 +114,43 @@ def evaluate(
             "replays": replays,
         },
     )
+    from tab_marl.evaluation.evaluate import Manner, evaluate_and_present
+
+    manner = Manner(engine, address, half_width, dry_run, retry_failed)
+    evaluate_and_present(settings, out, manner, f"tab-marl {shlex.join(sys.argv[1:])}")
+
+
+@app.command()
+def export(
+    out: Out = Path("runs/evaluation"),
+    kind: Annotated[str, typer.Option("--format", help="csv, or parquet (needs pyarrow).")] = "csv",
+    to: Annotated[Path | None, typer.Option(help="The file; default: OUT/episodes.csv or .parquet.")] = None,
+    key: Annotated[str | None, typer.Option("--settings", help="Settings key, if the folder holds several.")] = None,
+) -> None:
+    """Write stored episodes to one file for other programs, a row per episode."""
     from tab_marl.evaluation.console import notes_console
-    from tab_marl.evaluation.engines.local import LocalEngine
-    from tab_marl.evaluation.episode import play_job
-    from tab_marl.evaluation.evaluate import play_missing, prepare
+    from tab_marl.evaluation.export import check_format
+    from tab_marl.evaluation.export import export as write
     from tab_marl.evaluation.store import Store
 
-    notes = notes_console()
-    experiment = prepare(settings)
-    with Store.create(out) as store:
-        chosen = LocalEngine(play_job, settings.workers)
-        play_missing(experiment, store, chosen, notes, f"tab-marl {shlex.join(sys.argv[1:])}", retry_failed)
-        from tab_marl.evaluation.report.present import present
+    check_format(kind)
+    with Store.open(out) as store:
+        stored = _stored(store, out, key, notes_console())
+        path = to or store.path.parent / f"episodes.{kind}"
+        print(f"{write(store, stored.key, kind, path)} episodes: {path}")
 
-        present(store, store.settings()[0], out, settings.replays, notes)
+
+def _stored(store: Store, out: Path, key: str | None, notes: Console) -> StoredSettings:
+    """The settings whose key begins so, or the latest ones that have rows."""
+    known = [s for s in store.settings() if s.rows]
+    if not known:
+        raise UserError(f"{out}: no episode is stored here yet; run tab-marl evaluate")
+    matching = [s for s in known if key is None or s.key.startswith(key)]
+    if not matching:
+        raise UserError(f"no settings with key {key!r} in {store.path}; known: {', '.join(s.key for s in known)}")
+    if key is None and len(known) > 1:
+        notes.print(f"settings {known[0].key}, the latest of {len(known)}; --settings chooses another", highlight=False)
+    return matching[0]
 
 
 @app.command()
@@ -135,17 +171,8 @@ def report(
 
     notes = notes_console()
     with Store.open(out) as store:
-        known = [s for s in store.settings() if s.rows]
-        if not known:
-            raise UserError(f"{out}: no episode is stored here yet; run tab-marl evaluate")
-        matching = [s for s in known if key is None or s.key.startswith(key)]
-        if not matching:
-            raise UserError(f"no settings with key {key!r} in {store.path}; known: {', '.join(s.key for s in known)}")
-        if key is None and len(known) > 1:
-            notes.print(
-                f"settings {known[0].key}, the latest of {len(known)}; --settings chooses another", highlight=False
-            )
-        present(store, matching[0], store.path.parent, replays, notes, wanted)
+        stored = _stored(store, out, key, notes)
+        present(store, stored, store.path.parent, replays, notes, wanted)
 
 
 @app.command()
@@ -240,36 +267,81 @@ def train(
         raise typer.Exit(1)
 
 
-zoo_app = typer.Typer(help="The trained adversaries that ship with the package.", no_args_is_help=True)
+zoo_app = typer.Typer(help="Trained adversaries: those that ship, and your own.", no_args_is_help=True)
 app.add_typer(zoo_app, name="zoo")
 
 
 @zoo_app.command("list")
-def zoo_list() -> None:
-    """Every policy with its style and success."""
+def zoo_list(
+    split: Annotated[str | None, typer.Option(help="development or final; default: both.")] = None,
+    zoo: UserZoo = None,
+) -> None:
+    """Every policy: algorithm, style, split, success, and which figure its style moved."""
     from tab_marl.evaluation.zoo_view import zoo_table
 
-    zoo_table()
+    zoo_table(None if split is None else _split(split))
 
 
 @zoo_app.command("show")
-def zoo_show(name: Annotated[str, typer.Argument(help="Name of a policy.")]) -> None:
-    """The card of a policy."""
+def zoo_show(
+    name: Annotated[str, typer.Argument(help="Name of a policy, or its folder.")], zoo: UserZoo = None
+) -> None:
+    """Everything on the card of a policy."""
     from tab_marl.evaluation.zoo_view import zoo_card
 
     print(zoo_card(name))
 
 
+@zoo_app.command("add")
+def zoo_add(
+    model: Annotated[Path, typer.Argument(help="The .zip that model.save of stable-baselines3 or sb3-contrib wrote.")],
+    name: Annotated[str, typer.Option(help="What to call the policy.")],
+    style: Annotated[str, typer.Option(help="The adversary_style of the environment it was trained in.")] = "direct",
+    missions: Annotated[str, typer.Option(help="Comma-separated mission types that it claims.")] = "M1,M2,M3,M4,M5",
+    split: Annotated[str, typer.Option(help="development or final.")] = "development",
+    algorithm: Annotated[str, typer.Option(help="Default: what the file says.")] = "",
+    author: Annotated[str, typer.Option(help="Whose it is.")] = "",
+    description: Annotated[str, typer.Option(help="What it is, in a line.")] = "",
+    command: Annotated[str, typer.Option(help="What trains it again.")] = "",
+    normalisation: Annotated[
+        Path | None, typer.Option(help=".npz with mean and var of VecNormalize, if it was trained under that.")
+    ] = None,
+    episodes: Annotated[int, typer.Option(min=1, help="Held-out tasks per mission type that it is measured on.")] = 40,
+    anyway: Annotated[bool, typer.Option("--anyway", help="Add it below 90 %; its card will say so.")] = False,
+    zoo: UserZoo = None,
+) -> None:
+    """Let a model trained on our environments join your zoo: read as plain weights, measured, then written.
+
+    Refused if it completes less than 90 % of a mission type that it claims.
+    """
+    from tab_marl.agents.joining import Joining
+    from tab_marl.evaluation.zoo_view import add_to_zoo
+
+    _announce_first_use()
+    joining = Joining(
+        name, style, _names(missions) or (), _split(split), algorithm, author, description, command, normalisation
+    )
+    print(add_to_zoo(model, joining, anyway, episodes))
+
+
 @zoo_app.command("verify")
 def zoo_verify(
-    episodes: Annotated[int, typer.Option(min=1, help="Held-out tasks per mission type and family.")] = 10,
-    name: Annotated[str | None, typer.Argument(help="Name of a policy; default: all.")] = None,
+    episodes: Annotated[int, typer.Option(min=1, help="Fresh held-out tasks per mission type claimed.")] = 10,
+    name: Annotated[str | None, typer.Argument(help="Name of a policy, or its folder; default: all.")] = None,
+    zoo: UserZoo = None,
 ) -> None:
-    """Let policies complete held-out missions that nobody hinders; fails if one falls below what its card claims."""
+    """Check files and replay in pymunk what the cards claim; fails if a policy falls below 90 % beyond doubt."""
     from tab_marl.evaluation.zoo_view import verify_zoo
 
     _announce_first_use()
     raise typer.Exit(0 if verify_zoo(name, episodes) else 1)
+
+
+def _split(name: str) -> Literal[development, final]:
+    from tab_marl.evaluation.errors import require_known
+
+    (right,) = require_known("split", (name,), ("development", "final"))
+    return "final" if right == "final" else "development"
 
 
 def _announce_first_use(part: str = "planning") -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from tab_marl.evaluation.engines.interface import Engine, Result
-from tab_marl.evaluation.errors import Interrupted, UserError
+from tab_marl.evaluation.errors import Interrupted, UserError, require_known
 from tab_marl.evaluation.runner import Watch, run
 from tab_marl.evaluation.settings import EvaluationSettings, settings_key
 from tab_marl.evaluation.store import Store
@@ -54,6 +55,126 @@ def zoo_checksums(adversaries: tuple[str, ...]) -> dict[str, str]:
 
     cards = {last_part(name): getattr(opponent(name), "card", None) for name in adversaries}
     return {name: card.sha256 for name, card in cards.items() if card is not None}
+
+
+@dataclasses.dataclass(frozen=True)
+class Manner:
+    """How to run an evaluation: nothing in here changes a row."""
+
+    engine: str = "local"
+    """`local` or `ray`."""
+    address: str | None = None
+    """Of a Ray cluster; None: a Ray instance of this run's own."""
+    half_width: float = 5.0
+    """Points: the interval whose price in episodes is printed."""
+    dry_run: bool = False
+    retry_failed: bool = False
+
+    def __post_init__(self) -> None:
+        require_known("engine", (self.engine,), ENGINES)
+        if self.address is not None and self.engine != "ray":
+            raise UserError("--address is of a Ray cluster: add --engine ray")
+        if not 0.0 < self.half_width < 50.0:
+            raise UserError(f"half-width is {self.half_width:g}, must lie in (0, 50) points")
+
+
+ENGINES = ("local", "ray")
+
+
+def evaluate_and_present(settings: EvaluationSettings, out: Path, manner: Manner, hint: str) -> None:
+    """Say what it will take, play what the store in `out` lacks, print the tables and write the report.
+
+    `hint`: the command that continues it. Raises UserError.
+    """
+    from tab_marl.evaluation.console import notes_console
+    from tab_marl.evaluation.decision_times import summary
+    from tab_marl.evaluation.report.present import present, requested_rows
+
+    notes = notes_console()
+    experiment = prepare(settings)
+    with Store.create(out) as store:
+        if _announce(experiment, store, manner, notes):
+            return
+        play_missing(experiment, store, make_engine(experiment, manner, notes), notes, hint, manner.retry_failed)
+        stored = next(s for s in store.settings() if s.key == experiment.key)
+        present(store, stored, out, settings.replays, notes)
+        wanted = {r.key for r in requested_rows(store.rows(stored.key), stored.requested)}
+        for line in summary({k: t for k, t in store.timings(stored.key).items() if k in wanted}):
+            print(line)
+
+
+def make_engine(experiment: Experiment, manner: Manner, notes: Console) -> Engine:
+    """What plays the episodes. Raises UserError: Ray is not installed, or answers nowhere."""
+    from tab_marl.evaluation.engines.local import LocalEngine
+    from tab_marl.evaluation.episode import play_job
+
+    workers = experiment.settings.workers
+    if manner.engine == "local":
+        return LocalEngine(play_job, workers)
+    from tab_marl.evaluation.engines.cluster import RayEngine
+    from tab_marl.evaluation.engines.cluster_worker import pack
+    from tab_marl.evaluation.provenance import identity
+    from tab_marl.evaluation.settings import code_fingerprint
+
+    return RayEngine(
+        play_job, identity(code_fingerprint()), manner.address, workers, pack(experiment.adversaries), notes.print
+    )
+
+
+CALIBRATION_SECONDS = 120.0
+"""An estimate above this, with nothing stored, is worth a few seconds of measuring."""
+
+
+def _announce(experiment: Experiment, store: Store, manner: Manner, notes: Console) -> bool:
+    """Print the size, time and intervals of what is about to be played; True if that was all that was wanted."""
+    from tab_marl.evaluation import planning_ahead
+
+    settings = experiment.settings
+    done = store.keys(experiment.key)
+    missing = [
+        (m, f, p, seed)
+        for m in settings.missions
+        for f in settings.families
+        for p in settings.planners
+        for seed in range(settings.episodes)
+        if (m, f, p, seed) not in done
+    ]
+    if missing:
+        # Timings of other settings tell what an episode costs nearly as well as our own.
+        keys = [s.key for s in store.settings() if s.rows]
+        key = experiment.key if experiment.key in keys else (keys[0] if keys else None)
+        timings = {} if key is None else store.timings(key)
+        cost = planning_ahead.estimate(missing, timings)
+        if not timings and cost.processor_seconds > CALIBRATION_SECONDS:
+            if first_use():
+                notes.print(FIRST_USE, highlight=False)
+            speed = planning_ahead.speed_of(measured_decision_milliseconds())
+            cost = planning_ahead.estimate(missing, {}, speed)
+        workers = (settings.workers or os.cpu_count() or 1) if manner.engine == "local" else (settings.workers or 0)
+        for line in planning_ahead.forecast(
+            settings.episodes, manner.half_width / 100, store.rows(experiment.key), cost, workers
+        ):
+            notes.print(line, highlight=False)
+    elif manner.dry_run:
+        notes.print(f"nothing to play: all {settings.total} episodes are stored in {store.path}", highlight=False)
+    return manner.dry_run
+
+
+def measured_decision_milliseconds() -> float:
+    """Processor time of a decision of TAB-POMCP on M1, here and now: two short episodes, the first to load the kernels."""
+    import numpy as np
+
+    from tab_marl.agents.adversaries import ScriptedAdversary
+    from tab_marl.agents.planners import make_planner
+    from tab_marl.evaluation.episode import run_episode
+    from tab_marl.mission.tasks import sample_task
+
+    task = sample_task(np.random.default_rng(1), "M1", "point", None)
+    timing = None
+    for steps in (11, 60):
+        timing = run_episode(task, make_planner("TAB-POMCP"), ScriptedAdversary(), seed=1, max_steps=steps).timing
+    assert timing is not None
+    return 1000 * timing.decision_processor_seconds / timing.decisions
 
 
 def play_missing(
@@ -113,8 +234,6 @@ def failed_episodes(store: Store, key: str) -> list[Key]:
 
 def first_use(part: str = "planning") -> bool:
     """Whether no compiled kernel of this part of the package lies in the usual cache yet."""
-    import os
-
     import tab_marl
 
     if os.environ.get("NUMBA_CACHE_DIR"):

@@ -147,7 +147,7 @@ def _work(connection: Connection, play: Play, stop: Event) -> None:
             answer: tuple[Any, str] = (play(job), "")
         except Interrupted:
             return
-        except (Exception, MemoryError) as error:
+        except Exception as error:  # noqa: BLE001, the parent decides what an error of any kind means
             answer = (None, " ".join(f"{type(error).__name__}: {error}".split()))
         try:
             connection.send(answer)
