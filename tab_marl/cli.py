@@ -10,7 +10,7 @@ import shlex
 import signal
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 import typer
 
@@ -337,11 +337,12 @@ def zoo_verify(
     raise typer.Exit(0 if verify_zoo(name, episodes) else 1)
 
 
-def _split(name: str) -> Literal[development, final]:
+def _split(name: str) -> Split:
+    from tab_marl.agents.cards import SPLITS
     from tab_marl.evaluation.errors import require_known
 
-    (right,) = require_known("split", (name,), ("development", "final"))
-    return "final" if right == "final" else "development"
+    (right,) = require_known("split", (name,), SPLITS)
+    return next(split for split in SPLITS if split == right)
 
 
 def _announce_first_use(part: str = "planning") -> None:
