@@ -42,7 +42,8 @@ class Chromium:
                 PROGRAM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run",
                 "--remote-debugging-pipe", f"--user-data-dir={self.profile.name}", "about:blank",
             ],
-            preexec_fn=wire, close_fds=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            preexec_fn=wire,  # noqa: PLW1509, only system calls
+            close_fds=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
         os.close(to_read)
         os.close(from_write)

@@ -55,8 +55,7 @@ def outline(page):
     return found
 
 
-def test_page_is_whole_and_loads_nothing(data):
-    page = report.render(data)
+def test_page_is_whole_and_loads_nothing(page):
     found = outline(page)
     assert len(found.ids) == len(set(found.ids))
     for link in found.links:
@@ -69,8 +68,7 @@ def test_page_is_whole_and_loads_nothing(data):
         assert expected in text
 
 
-def test_rows_cannot_smuggle_markup(data):
-    page = report.render(data)
+def test_rows_cannot_smuggle_markup(page):
     assert "<script>alert" not in page and "<b>late" not in page
     assert "&lt;b&gt;late" in page
     embedded = re.search(r'<script type="application/json" id="replays">(.*?)</script>', page, re.DOTALL)[1]
@@ -84,15 +82,15 @@ def test_a_page_of_little(synthetic):
     assert "no comparison with TAB-POMCP" in page and 'id="replays"' not in page
 
 
-def test_broken_episodes_are_shown(data):
-    text = " ".join(outline(report.render(data)).text)
+def test_broken_episodes_are_shown(page):
+    text = " ".join(outline(page).text)
     assert "1 episodes broke down" in text and "ValueError: <script>" in text
 
 
-def test_report_that_cannot_be_written(data, tmp_path):
+def test_report_that_cannot_be_written(data, results, tmp_path):
     with pytest.raises(UserError, match="episodes are safe"):
-        report.write_report(data, tmp_path / "missing" / "report.html")
-    report.write_report(data, tmp_path / "report.html")
+        report.write_report(data, tmp_path / "missing" / "report.html", results)
+    report.write_report(data, tmp_path / "report.html", results)
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
 
 
@@ -148,6 +146,47 @@ def test_planners_differ_by_shape_not_colour_alone():
     assert len(shapes) == len(settings.PLANNERS)
 
 
+def seen_by(colour, kind):
+    """CIELAB of a colour as a protanope or deuteranope sees it (Machado, Oliveira and Fernandes 2009, severity 1)."""
+    linear = np.array([int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)])
+    linear = np.where(linear <= 0.04045, linear / 12.92, ((linear + 0.055) / 1.055) ** 2.4)
+    matrices = {
+        "normal": np.eye(3),
+        "protanope": [
+            [0.152286, 1.052583, -0.204868],
+            [0.114503, 0.786281, 0.099216],
+            [-0.003882, -0.048116, 1.051998],
+        ],
+        "deuteranope": [
+            [0.367322, 0.860646, -0.227968],
+            [0.280085, 0.672501, 0.047413],
+            [-0.011820, 0.042940, 0.968881],
+        ],
+    }
+    rgb = np.clip(np.array(matrices[kind]) @ linear, 0, 1)
+    to_xyz = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+    ratio = np.array(to_xyz) @ rgb / np.array([0.9505, 1.0, 1.089])
+    f = np.where(ratio > 0.008856, np.cbrt(ratio), 7.787 * ratio + 16 / 116)
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+def themes():
+    css = report._template("report.css")
+    return [
+        dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", block)) for block in re.findall(r"\{[^{}]*--page:[^{}]*\}", css)
+    ]
+
+
+@pytest.mark.parametrize("kind", ["normal", "protanope", "deuteranope"])
+def test_colours_differ_for_every_eye(kind):
+    """Beside their marks, the four planners that compete, and what lies on a map, differ in colour (CIE 1976 difference)."""
+    for theme in themes()[:2]:
+        for group in (("s", "fp", "mle", "tab"), ("ego", "adversary"), ("heat", "field")):
+            for first, second in itertools.combinations(group, 2):
+                apart = np.linalg.norm(seen_by(theme[first], kind) - seen_by(theme[second], kind))
+                assert apart > 15, (first, second, apart)
+
+
 def contrast(first, second):
     def luminance(colour):
         channels = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
@@ -159,12 +198,9 @@ def contrast(first, second):
 
 
 def test_text_has_contrast_in_light_and_dark():
-    css = report._template("report.css")
-    themes = [
-        dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", block)) for block in re.findall(r"\{[^{}]*--page:[^{}]*\}", css)
-    ]
-    assert len(themes) == 3 and themes[1] == themes[2]  # dark by preference is dark by choice
-    for theme in themes:
+    light, dark, chosen = themes()
+    assert dark == chosen  # dark by preference is dark by choice
+    for theme in (light, dark):
         for ink in [
             "ink",
             "soft",
