@@ -100,14 +100,14 @@ def train_population(
                     send.close()
                     running[receive] = (stand.name, process)
                     tell(stand.name, status=TASKS)
-                for receive in wait(list(running), timeout=POLL_SECONDS):
-                    assert isinstance(receive, Connection)
-                    name, process = running[receive]
+                for ready in wait(list(running), timeout=POLL_SECONDS):
+                    assert isinstance(ready, Connection)
+                    name, process = running[ready]
                     try:
-                        tell(name, **receive.recv())
+                        tell(name, **ready.recv())
                     except EOFError:
-                        del running[receive]
-                        receive.close()
+                        del running[ready]
+                        ready.close()
                         process.join()
                         if not stands[name].ended:
                             tell(name, status=FAILED, error=f"its process ended with status {process.exitcode}")

@@ -117,7 +117,8 @@ def _train(settings: TrainingSettings, folder: Path, on_progress: OnProgress | N
     if remaining > 0:
         watch = _Watch(settings, env, checkpoint, log, clock, on_progress)
         # The log is written by the watch: the algorithms would write theirs every few episodes.
-        model.learn(remaining, callback=watch, log_interval=None, reset_num_timesteps=False)
+        learner: Any = model
+        learner.learn(remaining, callback=watch, log_interval=None, reset_num_timesteps=False)
         model.logger.close()
         checkpoint.save(model, env, clock.record(), finished=True)
     return model
@@ -243,7 +244,7 @@ class _Watch(BaseCallback):
         seconds, cpu_seconds = self._clock.seconds, self._clock.cpu_seconds
         self._log.row(
             self.num_timesteps,
-            self.model._n_updates,  # type: ignore[attr-defined]
+            self.model._n_updates,
             seconds,
             cpu_seconds,
             float(np.mean(episodes)) if episodes else math.nan,
@@ -253,7 +254,7 @@ class _Watch(BaseCallback):
             if not math.isnan(share):
                 self.logger.record(f"success/{mission}", share)
         self.logger.record("time/cpu_seconds", cpu_seconds)
-        self.model.dump_logs()  # type: ignore[attr-defined]
+        self.model.dump_logs()
         if self._on_progress is not None:
             assert self._first_step is not None
             rate = (self.num_timesteps - self._first_step) / max(time.monotonic() - self._began, 1e-9)

@@ -20,6 +20,8 @@ from tab_marl.world.sampling import MapOptions
 
 TRAINING, HELD_OUT = 1, 2
 """Streams of tasks that never share a random number."""
+COMPOSED = "composed"
+"""In place of a family: the mission is a composition's name."""
 WINDOW = 400
 """Episodes over which success is averaged for the log."""
 
@@ -39,20 +41,19 @@ def draw_tasks(
     options: of the maps. compositions: names of `mission.compositions`, as many tasks each as of a mission and family.
     difficulty: the range in which the curriculum draws each task; see `difficulties`.
     """
-    kinds: list[tuple[str, ...]] = [(mission, family) for family in families for mission in missions]
-    kinds += [(composition,) for composition in compositions]
+    kinds = [(mission, family) for family in families for mission in missions]
+    kinds += [(composition, COMPOSED) for composition in compositions]
     hardness = [0.0] * count if difficulty is None else difficulties(stream, seed, count, difficulty)
     curriculum = Curriculum()
 
     def draw(i: int) -> Task:
-        rng, kind = np.random.default_rng((stream, seed, i)), kinds[i % len(kinds)]
-        if len(kind) == 1:
-            return sample_composition(
-                rng, kind[0], options=curriculum.map_options(hardness[i]) if difficulty else options
-            )
+        rng, (mission, family) = np.random.default_rng((stream, seed, i)), kinds[i % len(kinds)]
+        if family == COMPOSED:
+            maps = options if difficulty is None else curriculum.map_options(hardness[i])
+            return sample_composition(rng, mission, options=maps)
         if difficulty is None:
-            return sample_task(rng, *kind, options=options)
-        return curriculum.sample_task(rng, hardness[i], *kind)
+            return sample_task(rng, mission, family, options=options)
+        return curriculum.sample_task(rng, hardness[i], mission, family)
 
     return [draw(i) for i in range(count)]
 

@@ -89,6 +89,11 @@ def test_help_is_quick_and_imports_nothing_heavy():
         (["train", "--style", "sidee"], "did you mean 'side'"),
         (["train", "--steps", "0"], "steps is 0, must be >= 1"),
         (["train", "--config", "none.toml"], "none.toml"),
+        (["train", "none.toml"], "none.toml"),
+        (["train", "shipped", "--style", "side"], "--style is for a single policy"),
+        (["train", "shipped", "--only", "sied"], "did you mean 'side'"),
+        (["train", "shipped", "--steps", "-3"], "steps is -3, must be >= 1"),
+        (["train", "--workers", "2"], "--only and --workers are for a population"),
         (["zoo", "show", "drect"], "did you mean 'direct'"),
     ],
 )

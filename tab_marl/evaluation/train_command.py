@@ -38,6 +38,7 @@ def train_one(
     if config is not None and (style is not None or algorithm is not None):
         raise UserError("give --config, or --style and --algorithm, not both: the file holds them")
     given = {name: value for name, value in changes.items() if value is not None}
+    _check_steps(given.get("steps"))
     with user_input():
         if config is not None:
             settings = replace(TrainingSettings.from_toml(config), **given)
@@ -81,6 +82,7 @@ def train_many(
     from tab_marl.agents.population_report import write_report
     from tab_marl.agents.population_run import DONE, FAILED, train_population
 
+    _check_steps(steps)
     population = Population.load(file)
     if only:
         population = population.only(only)
@@ -107,6 +109,12 @@ def train_many(
         highlight=False,
     )
     return not failed
+
+
+def _check_steps(steps: int | None) -> None:
+    # In settings 0 means "as the hyperparameters say"; who types it means something else.
+    if steps is not None and steps < 1:
+        raise UserError(f"steps is {steps}, must be >= 1")
 
 
 def shares(success: Mapping[str, float] | None) -> str:
