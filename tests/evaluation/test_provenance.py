@@ -33,9 +33,10 @@ def test_versions_machine_settings_zoo_and_commit_are_there():
 
 def test_nobody_is_named():
     text = json.dumps(record())
-    for private in (platform.node(), str(Path.home()), "/home/", "somebody"):
+    for private in (str(Path.home()), "/home/", "somebody"):
         assert private not in text
-    assert not re.search(rf"\b{re.escape(getpass.getuser())}\b", text)
+    for name in (platform.node(), getpass.getuser()):
+        assert not re.search(rf"\b{re.escape(name)}\b", text)
 
 
 def test_a_run_is_kept_with_its_times_and_described(tmp_path, synthetic):
@@ -47,7 +48,7 @@ def test_a_run_is_kept_with_its_times_and_described(tmp_path, synthetic):
         second = store.begin_run("k", record())
         runs = store.runs("k")
     assert [(r.run, r.outcome, r.played) for r in runs] == [(first, "finished", 1), (second, None, 0)]
-    assert runs[0].started <= runs[0].ended and runs[1].ended is None and runs[0].record == record()
+    assert runs[0].started <= runs[0].ended and runs[1].ended is None and runs[0].record == json.loads(json.dumps(record()))
     one, two = provenance.describe_runs(runs)
     assert one["episodes"] == "1" and "numpy " in one["versions"] and one["engine"] == "local (workers 2)"
     assert "killed" in two["ended"] and one["zoo"] == "direct abababababab"
