@@ -15,11 +15,13 @@ from tab_marl.agents.planner_memory import PlannerMemory
 from tab_marl.agents.planners import PlannerOptions
 from tab_marl.agents.rollouts import run_bank
 from tab_marl.agents.training_env import HELD_OUT, build_bank, draw_tasks
-from tab_marl.agents.validation import WINDING_RADIANS, wilson
+from tab_marl.agents.validation import wilson
 from tab_marl.agents.zoo import ZooPolicy
 from tab_marl.envs.styles import STYLES, Style
 from tab_marl.mission.tasks import MISSION_IDS, Task
 
+TURN_RADIANS = 0.3
+"""A way that turns less than this about the arena's centre takes neither side."""
 BLOCK = 20
 """Tasks played side by side, and whose fields are kept."""
 
@@ -54,17 +56,19 @@ def study(
     seed: int,
     seen_metres: float = 0.0,
     options: PlannerOptions | None = None,
-    on_played: Callable[[int, int], None] | None = None,
+    on_block: Callable[[list[HuntedRow]], None] | None = None,
 ) -> list[HuntedRow]:
     """Every policy against every ego on the same `count` held-out tasks of a family, missions in turn, from the same starts.
 
-    `policies`: by name, with the style to play in. `options`: the planners' (default: those of an evaluation).
+    `policies`: by name, with the style to play in. `options`: the planners' (default: those of an evaluation). `on_block`
+    is called with the rows of every BLOCK tasks.
     """
     tasks = draw_tasks(HELD_OUT, seed, count, MISSION_IDS, (family,))
     rows: list[HuntedRow] = []
     for first in range(0, count, BLOCK):
         block = range(first, min(count, first + BLOCK))
         hunting = replace(options or PlannerOptions(), memory=PlannerMemory())
+        before = len(rows)
         for ego in egos:
             for name, (policy, style) in policies.items():
                 built = [aware_task(tasks[i], style, np.random.default_rng((seed, i)), seen_metres) for i in block]
@@ -76,8 +80,8 @@ def study(
                     )
                     for j, i in enumerate(block)
                 ]  # fmt: skip
-        if on_played is not None:
-            on_played(block[-1] + 1, count)
+        if on_block is not None:
+            on_block(rows[before:])
     return rows
 
 
@@ -122,8 +126,8 @@ def unhunted(policy: ZooPolicy, style: Style, family: str, count: int, seed: int
         for i in np.flatnonzero(ways.completed & plain.completed):
             path, other = (r.positions[i, : r.end[i] + 1].astype(np.float64) for r in (ways, plain))
             turned, usual = _winding(path, tasks[i]), _winding(other, tasks[i])
-            if abs(usual) >= WINDING_RADIANS:
-                side.append(abs(turned) >= WINDING_RADIANS and np.sign(turned) == np.sign(usual))
+            if abs(usual) >= TURN_RADIANS:
+                side.append(abs(turned) >= TURN_RADIANS and np.sign(turned) == np.sign(usual))
             last.append(ways.places[i][-1:] == plain.places[i][-1:])
             stretch.append(_length(path) / _length(other))
     return Unhunted(*(float(np.mean(values)) for values in (done, side, last, stretch)))

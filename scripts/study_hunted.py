@@ -39,35 +39,34 @@ def main(
     family: str = "ambiguous",
     seed: int = 4242,
     seen_metres: Annotated[float, typer.Option(help="Range in which the adversary sees the ego; 0: blind.")] = 0.0,
-    only: Annotated[str, typer.Option(help="Of direct, even, learned: comma-separated.")] = "direct,even,learned",
+    rows: Annotated[Path, typer.Option(help="CSV file.")] = ROWS,
 ) -> None:
     console = Console()
-    for given in policies:
+    players = {}
+    for i, given in enumerate(policies):
         policy = load_policy(given) if Path(given).is_dir() else find_policy(given)
-        players = {
-            f"{policy.name}, {kind}": (policy, style)
-            for kind, style in styles_of(policy).items()
-            if kind in only.split(",")
-        }
-        for name, (_, style) in players.items():
-            found = unhunted(policy, style, family, 200, seed)
-            console.print(f"{name}: {entropy_bits(style):.2f} bits, unopposed {found}")
+        for kind, style in styles_of(policy).items():
+            # The others' weights differ from the first one's by their seed alone.
+            if i == 0 or kind == "learned":
+                players[f"{policy.name}, {kind}"] = (policy, style)
+    for name, (policy, style) in players.items():
+        console.print(f"{name}: {entropy_bits(style):.2f} bits; unopposed {unhunted(policy, style, family, 100, seed)}")
 
-        def tell(done: int, total: int, name: str = policy.name) -> None:
-            console.print(f"{name}: {done} of {total} tasks")
+    def keep(block: list[HuntedRow]) -> None:
+        _append(block, rows)
+        console.print(f"task {block[-1].task + 1} of {episodes}")
 
-        rows = study(players, family, episodes, egos.split(","), seed, seen_metres, on_played=tell)
-        _append(rows)
-    everything = _read()
+    study(players, family, episodes, egos.split(","), seed, seen_metres, on_block=keep)
+    everything = _read(rows)
     console.print(_table(everything))
     _draw(everything)
 
 
-def _append(rows: list[HuntedRow]) -> None:
-    known = {_key(row) for row in _read()}
-    ROWS.parent.mkdir(parents=True, exist_ok=True)
-    new = not ROWS.exists()
-    with ROWS.open("a", newline="", encoding="utf-8") as file:
+def _append(rows: list[HuntedRow], path: Path) -> None:
+    known = {_key(row) for row in _read(path)}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    new = not path.exists()
+    with path.open("a", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, [f.name for f in fields(HuntedRow)], lineterminator="\n")
         if new:
             writer.writeheader()
@@ -78,10 +77,10 @@ def _key(row: HuntedRow) -> tuple[str, str, str, int, bool]:
     return row.policy, row.ego, row.family, row.task, row.sees_ego
 
 
-def _read() -> list[HuntedRow]:
-    if not ROWS.exists():
+def _read(path: Path) -> list[HuntedRow]:
+    if not path.exists():
         return []
-    with ROWS.open(encoding="utf-8") as file:
+    with path.open(encoding="utf-8") as file:
         return [
             HuntedRow(
                 row["policy"], row["style"], row["ego"], row["mission"], row["family"], int(row["task"]),

@@ -13,7 +13,9 @@ from scipy.stats import chisquare
 
 from tab_marl.agents.adversaries import ScriptedAdversary
 from tab_marl.agents.habits import HabitSettings, MixtureLearner, learn_habits, learned_style, with_weights
+from tab_marl.agents.hunted_study import entropy_bits, shares, study, unhunted
 from tab_marl.agents.training_env import HELD_OUT, draw_tasks
+from tab_marl.agents.zoo import load_zoo
 from tab_marl.envs.adversary_observation import AdversaryTask
 from tab_marl.envs.styles import STYLES, Habit, Style, mixture_of
 
@@ -141,3 +143,20 @@ def test_rare_habits_are_dropped_and_weights_still_sum_to_one() -> None:
     assert [habit.style.name for habit in kept.mixture] == ["a", "b"]
     assert sum(habit.weight for habit in kept.mixture) == pytest.approx(1.0, abs=1e-9)
     assert kept.mixture[0].weight == pytest.approx(0.6 / 0.996, abs=1e-4)
+
+
+def test_the_study_of_hunted_policies() -> None:
+    policy = load_zoo()[0]
+    players = {"a": (policy, STYLES["direct"]), "b": (policy, THREE)}
+    blocks: list[int] = []
+    rows = study(players, "ambiguous", 3, ["pursue"], 5, on_block=lambda block: blocks.append(len(block)))
+    assert len(rows) == sum(blocks) == 6
+    assert rows == study(players, "ambiguous", 3, ["pursue"], 5)
+    done, n, low, high = shares(rows)["a", "pursue"]
+    assert n == 3 and low <= done / n <= high
+    assert done == sum(row.completed for row in rows if row.policy == "a")
+    # Against itself the direct style goes the same way.
+    alike = unhunted(policy, STYLES["direct"], "ambiguous", 5, 5, draws=1)
+    assert alike.same_last_goal == 1.0
+    assert alike.stretch == pytest.approx(1.0, abs=0.3)
+    assert entropy_bits(THREE) == pytest.approx(-(0.1 * np.log2(0.1) + 0.2 * np.log2(0.2) + 0.7 * np.log2(0.7)))
