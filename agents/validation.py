@@ -1,7 +1,4 @@
-"""What a policy does when nobody hunts it: success on held-out tasks, in both worlds, and the figures of its style.
-
-A style counts only if its *own* figure moves against direct policies trained with other seeds on the same tasks.
-"""
+"""What a policy does when nobody hunts it: success on held-out tasks, in both worlds."""
 
 from __future__ import annotations
 
@@ -16,7 +13,6 @@ from tab_marl.agents.adversaries import AdversaryPolicy
 from tab_marl.agents.cards import MissionRecord
 from tab_marl.agents.rollouts import Rollouts, run_bank
 from tab_marl.agents.training_env import HELD_OUT, build_bank, draw_tasks
-from tab_marl.envs.adversary_kernels import VIA_METRES
 from tab_marl.envs.adversary_observation import AdversaryTask
 from tab_marl.envs.batched import Bank
 from tab_marl.envs.intercept import ADVERSARY_AGENT, EGO_AGENT, InterceptEnv
@@ -25,9 +21,6 @@ from tab_marl.mission.tasks import Task
 from tab_marl.world.grid import GridMap
 
 BATCHED, PHYSICS = "batched", "physics"
-WINDING_RADIANS = 0.3
-"""A way that turns less than this about the arena's centre takes neither side."""
-SPREAD_POINTS = 21
 NEVER_MET_METRES = 1e-3
 
 
@@ -111,93 +104,6 @@ def _parking(task: Task) -> tuple[float, float]:
     return float(x), float(y)
 
 
-def style_figures(bank: Bank, rollouts: Rollouts, again: Rollouts | None = None) -> dict[str, float]:
-    """The figures that styles move, over completed episodes; nan where nothing of the kind was drawn.
-
-    `bank` says what was drawn (side, via points); the rollouts may be those of a control on its own bank of the same
-    tasks in the same order. `again`: other draws on the same tasks, for the spread.
-    """
-    done = np.flatnonzero(rollouts.completed).tolist()
-    tasks = [bank.tasks[int(rollouts.task[i])] for i in range(len(rollouts.task))]
-    figures = {
-        "side taken as drawn": _mean([_side_match(tasks[i], _path(rollouts, i)) for i in done]),
-        "via points reached": _mean([_via_reached(tasks[i], _path(rollouts, i)) for i in done]),
-        "seconds under other cameras": _mean(
-            [_other_camera_seconds(tasks[i], _path(rollouts, i), rollouts.places[i]) for i in done]
-        ),
-        "time used / allowed": _mean([_time_share(tasks[i], int(rollouts.end[i])) for i in done]),
-        "length / shortest": _mean([_stretch(tasks[i], _path(rollouts, i)) for i in done]),
-        "touches per episode": float(rollouts.touches.mean()),
-    }
-    if again is not None:
-        both = np.flatnonzero(rollouts.completed & again.completed).tolist()
-        figures["spread between episodes, metres"] = _mean([_spread(_path(rollouts, i), _path(again, i)) for i in both])
-    return figures
-
-
-def other_places(bank: Bank, rollouts: Rollouts, reference: Rollouts) -> float:
-    """Share of episodes whose visited places differ from the reference's on the same task, where they could differ."""
-    both = np.flatnonzero(rollouts.completed & reference.completed).tolist()
-    open_choice = [
-        i
-        for i in both
-        if len(bank.tasks[int(rollouts.task[i])].automaton.branch_places) > len(set(reference.places[i]))
-    ]
-    return _mean([float(rollouts.places[i] != reference.places[i]) for i in open_choice])
-
-
-def _path(rollouts: Rollouts, i: int) -> NDArray[np.float64]:
-    return rollouts.positions[i, : rollouts.end[i] + 1].astype(np.float64)
-
-
-def _mean(values: Sequence[float]) -> float:
-    known = [v for v in values if not math.isnan(v)]
-    return float(np.mean(known)) if known else math.nan
-
-
-def _side_match(task: AdversaryTask, path: NDArray[np.float64]) -> float:
-    if task.latents.side == 0 or task.strength == 0:
-        return math.nan
-    x, y = path.T - [[task.scenario.width_metres / 2], [task.scenario.height_metres / 2]]
-    winding = float(np.diff(np.unwrap(np.arctan2(y, x))).sum())
-    return math.nan if abs(winding) < WINDING_RADIANS else float(np.sign(winding) == task.latents.side)
-
-
-def _via_reached(task: AdversaryTask, path: NDArray[np.float64]) -> float:
-    if len(task.parts.via) == 0:
-        return math.nan
-    return float(all((np.hypot(*(path - point).T) <= VIA_METRES).any() for point in task.parts.via))
-
-
-def _other_camera_seconds(task: AdversaryTask, path: NDArray[np.float64], visited: Sequence[str]) -> float:
-    """Seconds under the cameras of checkpoints that were not visited: those that a way can avoid."""
-    seen = np.zeros(len(path), dtype=bool)
-    for checkpoint in task.scenario.checkpoints:
-        if checkpoint.name not in visited:
-            seen |= checkpoint.camera.contains(path)
-    return float(seen.sum()) / task.scenario.control_hertz
-
-
-def _time_share(task: AdversaryTask, end: int) -> float:
-    allowed = allowed_seconds(task)
-    return math.nan if math.isinf(allowed) else end / task.scenario.control_hertz / allowed
-
-
-def _stretch(task: AdversaryTask, path: NDArray[np.float64]) -> float:
-    plain = task.parts.plain
-    return float(np.hypot(*np.diff(path, axis=0).T).sum()) / float(plain.metres(task.parts.via_home, path[0])[0])
-
-
-def _spread(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
-    """Mean distance in metres between two paths at equal shares of their lengths."""
-    shares = np.linspace(0, 1, SPREAD_POINTS)
-    points = []
-    for path in (first, second):
-        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
-        points.append(np.stack([np.interp(shares * along[-1], along, path[:, k]) for k in (0, 1)], axis=1))
-    return float(np.hypot(*(points[0] - points[1]).T).mean())
-
-
 def allowed_seconds(task: AdversaryTask) -> float:
     """The most time that the mission allows along its plain route; inf if nothing but the horizon of others bounds it."""
     automaton, tick = task.automaton, task.automaton.tick_seconds
@@ -224,25 +130,3 @@ def run_held_out(policy: AdversaryPolicy, held_out: HeldOut, draw: int = 0) -> t
     bank = held_out.bank(policy, draw)
     rng = np.random.default_rng((held_out.seed, draw))
     return bank, run_bank(policy, bank, np.arange(len(bank)), rng)
-
-
-def measure_success(
-    policy: AdversaryPolicy,
-    per_mission: int,
-    seed: int = 99,
-    world: str = PHYSICS,
-    missions: Sequence[str] = ("M1", "M2", "M3", "M4", "M5"),
-    on_played: Callable[[int, int], None] | None = None,
-) -> list[MissionRecord]:
-    """Unopposed success on `per_mission` held-out tasks of each mission type, families in turn.
-
-    world: "physics" (pymunk) or "batched". Raises ValueError for another.
-    """
-    if world not in (BATCHED, PHYSICS):
-        raise ValueError(f"world is {world!r}, must be {BATCHED!r} or {PHYSICS!r}")
-    held_out = HeldOut.draw(per_mission * len(missions), seed, missions)
-    if world == BATCHED:
-        completed = run_held_out(policy, held_out)[1].completed
-    else:
-        completed = play_physics(policy, held_out.tasks, seed, on_played)
-    return mission_records(held_out.missions, completed, world)

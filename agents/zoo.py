@@ -43,6 +43,8 @@ __all__ = [
 CARD_FILE = "card.json"
 WEIGHTS_FILE = "weights.safetensors"
 SHIPPED = Path(__file__).parent / "zoo"
+CONTROLS = Path(__file__).parent / "controls"
+"""Direct policies trained with other seeds, against which a style's own figure must move; they are no adversaries."""
 ZOO_VARIABLE = "TAB_MARL_ZOO"
 """Environment variable that names the user's zoo."""
 LARGEST_CARD_BYTES = 2**20
@@ -51,6 +53,10 @@ LARGEST_WEIGHTS_BYTES = 64 * 2**20
 
 class PolicyError(ValueError):
     """A policy that cannot be loaded; one line that names the file and says what is wrong with it."""
+
+    def __init__(self, said: str) -> None:
+        # What a file says may stand in it: nothing that a terminal would do more than print.
+        super().__init__("".join(c if c.isprintable() else "?" for c in said))
 
 
 @dataclass(frozen=True, eq=False)

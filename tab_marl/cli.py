@@ -10,7 +10,7 @@ import shlex
 import signal
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -19,6 +19,7 @@ from tab_marl.evaluation.errors import UserError
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from tab_marl.agents.cards import Split
     from tab_marl.evaluation.store import Store, StoredSettings
 
 app = typer.Typer(
