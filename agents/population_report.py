@@ -16,7 +16,7 @@ from tab_marl.agents.population import Population
 from tab_marl.agents.population_run import FAILED, MemberStand
 from tab_marl.agents.training_algorithms import ALGORITHMS
 from tab_marl.agents.training_log import LearningCurve, read_log
-from tab_marl.agents.training_settings import TrainingSettings
+from tab_marl.agents.training_settings import UNOPPOSED, TrainingSettings
 
 PAGE_FILE, PICTURE_FILE = "population.html", "learning-curves.png"
 COMPETENT = 0.9
@@ -49,12 +49,13 @@ class Line:
 
     @property
     def competent_minutes(self) -> float:
-        """CPU minutes until all mission types were at 90 % at once; nan if they never were."""
+        """CPU minutes after which all mission types stayed at 90 % or more; nan if they did not."""
         if self.curve is None:
             return math.nan
         lowest = np.min(list(self.curve.success.values()), axis=0)
-        reached = np.flatnonzero(lowest >= COMPETENT)
-        return float(self.curve.cpu_seconds[reached[0]]) / 60 if len(reached) else math.nan
+        below = np.flatnonzero(~(lowest >= COMPETENT))  # unknown counts as below
+        first = int(below[-1]) + 1 if len(below) else 0
+        return float(self.curve.cpu_seconds[first]) / 60 if first < len(lowest) else math.nan
 
 
 def write_report(population: Population, stands: Mapping[str, MemberStand], out_dir: Path | str) -> Path:
@@ -100,6 +101,12 @@ def network_of(settings: TrainingSettings) -> str:
     return f"{f'LSTM {settings.lstm_units}, ' if settings.lstm_units else ''}{widths} {settings.activation}"
 
 
+def hunters_of(settings: TrainingSettings) -> str:
+    """Whom it was hunted by while networks or habits learned; "none"."""
+    hunters = [names for names in (settings.opponent, settings.habits_against) if names not in ("", UNOPPOSED)]
+    return ", ".join(hunters) or UNOPPOSED
+
+
 def _row(line: Line, missions: Sequence[str]) -> dict[str, Any]:
     stand, settings = line.stand, line.stand.settings
     return {
@@ -107,7 +114,7 @@ def _row(line: Line, missions: Sequence[str]) -> dict[str, Any]:
         "algorithm": ALGORITHMS[settings.algorithm].title,
         "network": network_of(settings),
         "style": settings.style.name,
-        "opponent": settings.opponent,
+        "opponent": hunters_of(settings),
         "split": settings.split,
         "steps": f"{stand.steps / 1e6:.2f}",
         "minutes": f"{line.minutes:.1f}",
@@ -121,9 +128,13 @@ def _row(line: Line, missions: Sequence[str]) -> dict[str, Any]:
 def _card(line: Line, missions: Sequence[str]) -> dict[str, Any]:
     settings = line.stand.settings
     note = f"{ALGORITHMS[settings.algorithm].title}, {network_of(settings)}, seed {settings.seed}"
+    if settings.opponent != UNOPPOSED:
+        note += f", hunted by {settings.opponent}"
+    if settings.habits_against:
+        note += f", then {settings.habit_episodes} episodes of learning habits against {settings.habits_against}"
     return {
         "name": settings.name,
-        "note": note + ("" if settings.opponent == "none" else f", hunted by {settings.opponent}"),
+        "note": note,
         "svg": curve_svg(line.curve, missions, settings.name) if line.curve is not None else "",
         "error": line.stand.error,
     }

@@ -15,7 +15,7 @@ from rich.console import Console
 from safetensors.numpy import load_file
 
 from tab_marl.agents.population import FOLDER, Population
-from tab_marl.agents.population_report import PAGE_FILE, PICTURE_FILE, curve_svg, write_report
+from tab_marl.agents.population_report import PAGE_FILE, PICTURE_FILE, Line, curve_svg, write_report
 from tab_marl.agents.population_run import (
     DONE,
     ERROR_FILE,
@@ -274,3 +274,14 @@ def test_time_left_counts_every_member_and_the_workers():
 @pytest.mark.parametrize(("seconds", "said"), [(0, "0:00"), (62.4, "1:02"), (3723, "1:02:03")])
 def test_a_clock_reads_well(seconds, said):
     assert clock(seconds) == said
+
+
+@pytest.mark.parametrize(
+    ("lowest", "minutes"),
+    [([np.nan, 1.0, 0.5, 0.95, 0.9], 4.0), ([1.0] * 5, 1.0), ([0.95, 0.95, 0.95, 0.95, 0.8], np.nan)],
+)
+def test_competence_counts_from_where_it_lasted(lowest, minutes):
+    ones = np.ones(5)
+    curve = LearningCurve(ones, 60.0 * np.arange(1.0, 6.0), ones, {"M1": ones, "M2": np.array(lowest)})
+    stand = MemberStand(TrainingSettings(), None)
+    assert Line(stand, curve).competent_minutes == pytest.approx(minutes, nan_ok=True)
