@@ -78,6 +78,17 @@ def play_slowly(job: Job):
     return play(job)
 
 
+def play_saying_where(job: Job):
+    """On a Ray cluster: the timing's text is the node that played."""
+    import dataclasses
+
+    import ray
+
+    node = ray.get_runtime_context().get_node_id()
+    time.sleep(0.05)
+    return [(row, dataclasses.replace(spent, traceback=node)) for row, spent in play(job)]
+
+
 def play_and_break(job: Job):
     """Workers die of one planner's episode, always, and of another's the first time."""
     if job.unit.seed == 3 and job.unit.mission == "M4":
@@ -97,7 +108,10 @@ def play_and_always_break(job: Job):
 def play_noting(job: Job):
     """Each episode leaves a line: to see how often it was played, and by whom."""
     with Path(os.environ["SYNTHETIC_MARKER"]).open("a") as log:
-        log.writelines(f"{job.unit.mission} {job.unit.family} {planner} {job.unit.seed} {os.getppid()}\n" for planner in job.planners)
+        log.writelines(
+            f"{job.unit.mission} {job.unit.family} {planner} {job.unit.seed} {os.getppid()}\n"
+            for planner in job.planners
+        )
     return play_slowly(job)
 
 
