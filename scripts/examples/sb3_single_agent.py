@@ -81,7 +81,7 @@ def frozen(model: PPO):
     return lambda observation: model.predict(observation, deterministic=True)[0]
 
 
-def main(steps: int = 300_000, seed: int = 0) -> None:
+def main(steps: int = 150_000, seed: int = 0) -> None:
     adversary = learn("Adversary", "static", steps, seed=seed)
     learn("Ego", frozen(adversary), steps, seed=seed)
     learn("Ego", tm.load_zoo()[0], steps, seed=seed)  # and against a policy that ships
