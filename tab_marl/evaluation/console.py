@@ -66,7 +66,7 @@ def difference(paired: Paired | None, scale: float) -> str:
     if paired is None:
         return ""
     d = paired.difference
-    return f"{scale * d.value:+.0f} [{scale * d.low:+.0f}, {scale * d.high:+.0f}] p {stars(paired.p_value)}"
+    return f"{scale * d.value:+.0f} [{scale * d.low:+.0f}, {scale * d.high:+.0f}] p {stars(paired.p_value if paired.adjusted is None else paired.adjusted)}"
 
 
 def notes_console() -> Console:
@@ -79,12 +79,12 @@ MEASURED = ("", "planner", "n", "ATCR % [95 %]", "paper", "StI [95 %]", "paper")
 PAIRED = ("ATCR - TAB, points", "StI - TAB, steps")
 
 
-def print_tables(rows: Sequence[EpisodeRow], console: Console) -> None:
+def print_tables(rows: Sequence[EpisodeRow], console: Console, lines: Sequence[Line] | None = None) -> None:
     """Per family: ATCR and StI with intervals, the paper's figures, paired differences against TAB-POMCP.
 
-    On a narrow terminal the differences follow in a table of their own.
+    On a narrow terminal the differences follow in a table of their own. `lines` are those of the rows, if computed already.
     """
-    found = tables.lines(rows)
+    found = tables.lines(rows) if lines is None else lines
     whole = console.width >= WIDTH
     for family in dict.fromkeys(line.family for line in found):
         part = [line for line in found if line.family == family]
@@ -97,7 +97,7 @@ def print_tables(rows: Sequence[EpisodeRow], console: Console) -> None:
         "ATCR: episodes in which the adversary completed its mission before interception (lower is better). "
         "StI: 100 Hz physics steps to interception, censored at the horizon.\n"
         "Differences are this planner minus TAB-POMCP over the same seeds (positive: TAB-POMCP is better); p by exact "
-        "McNemar test and Wilcoxon signed-rank test.\nPaper: L4DC 2025, its own arena. † all episodes alike: exact binomial bound.",
+        "McNemar test and Wilcoxon signed-rank test after Holm's correction.\nPaper: L4DC 2025, its own arena. † all episodes alike: exact binomial bound.",
         style="dim",
         highlight=False,
     )

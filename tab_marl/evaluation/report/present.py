@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +61,14 @@ def present(
     """
     rows = requested_rows(store.rows(stored.key), stored.requested)
     out = Console(width=None if notes.is_terminal else text.WIDTH, highlight=False)
-    text.print_tables(rows, out)
+    keys = {r.key for r in rows}
+    timings = {key: timing for key, timing in store.timings(stored.key).items() if key in keys}
+    cards = describe_adversaries(stored.content["adversaries"])
+    data = ReportData(
+        rows, timings, stored.content, stored.key, (), None, cards, tab_marl.__version__, record_of(store, stored.key)
+    )
+    results = compute(data)
+    text.print_tables(rows, out, results.lines)
     count = stored.requested.get("replays", DEFAULT_REPLAYS) if replays is None else replays
     if wanted.films and not count:
         raise UserError("films are made of the report's replays, and there are none: ask for --replays 1 or more")
@@ -76,13 +83,7 @@ def present(
     workers = stored.requested.get("workers") or os.cpu_count() or 1
     planners = tables.order([r.planner for r in rows], PLANNERS)
     groups = replay_groups(choices, planners, stored.content, store, stored.key, workers)
-    keys = {r.key for r in rows}
-    timings = {key: timing for key, timing in store.timings(stored.key).items() if key in keys}
-    cards = describe_adversaries(stored.content["adversaries"])
-    data = ReportData(
-        rows, timings, stored.content, stored.key, groups, explanation(), cards, tab_marl.__version__, record_of(store, stored.key)
-    )  # fmt: skip
-    results = compute(data)
+    data = replace(data, replays=groups, figures=explanation())
     path = folder / REPORT_NAME
     write_report(data, path, results)
     out.print(f"report: {path}")

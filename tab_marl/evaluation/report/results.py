@@ -69,14 +69,15 @@ def compute(data: ReportData) -> Results:
             parts = table.loc[table[column].astype(str) != "", column].dropna()
             if column in ("adversary", "slack_bin") or 1 < parts.nunique() < table["adversary"].nunique():
                 by[column] = tables.by_part(table, column)
+    met = statistics.survival_curves(table, "met")
     return Results(
         table,
         tables.lines(table),
         statistics.aggregates(table),
         statistics.performance_profiles(table),
         statistics.survival_curves(table, "completed"),
-        statistics.survival_curves(table, "met"),
-        statistics.restricted_means(table),
+        met,
+        statistics.restricted_means(table, met),
         by,
         tables.where_ego_is_first(table),
         data.timings,

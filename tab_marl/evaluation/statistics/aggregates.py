@@ -12,7 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from tab_marl.evaluation.statistics.intervals import CONFIDENCE, SEED, Floats, Interval, quantile_interval
+from tab_marl.evaluation.statistics.intervals import (
+    CONFIDENCE,
+    SEED,
+    Floats,
+    Interval,
+    quantile_interval,
+    resampled_places,
+)
 
 AGGREGATE_RESAMPLES = 2000
 """As many as rliable draws for profiles."""
@@ -51,7 +58,7 @@ def probability_of_improvement(first: Scores, second: Scores) -> float:
 
 def resampled(scores: Scores, rng: np.random.Generator, count: int) -> list[Floats]:
     """Stratified bootstrap: per mission ``[count, n]`` episodes drawn with replacement."""
-    return [s[rng.integers(len(s), size=(count, len(s)))] for s in scores]
+    return [s[resampled_places(len(s), count, rng)] for s in scores]
 
 
 def aggregate(scores: Scores, function: Callable[[Scores], float] = interquartile_mean, seed: int = SEED) -> Interval:
@@ -59,8 +66,9 @@ def aggregate(scores: Scores, function: Callable[[Scores], float] = interquartil
     _check(scores)
     drawn = resampled(scores, np.random.default_rng(seed), AGGREGATE_RESAMPLES)
     if function is interquartile_mean:  # the one that every report needs, in one sweep
-        pooled = np.sort(np.concatenate(drawn, axis=1), axis=1)
+        pooled = np.concatenate(drawn, axis=1)
         cut = int(0.25 * pooled.shape[1])
+        pooled.partition((cut, pooled.shape[1] - cut - 1), axis=1)
         values = pooled[:, cut : pooled.shape[1] - cut].mean(axis=1)
     else:
         values = np.array([function([d[k] for d in drawn]) for k in range(AGGREGATE_RESAMPLES)])

@@ -52,6 +52,8 @@ def frame(rows: pd.DataFrame | Sequence[EpisodeRow], styles: Mapping[str, str] |
     for name, otherwise in (("error", None), ("completed_step", np.nan), ("slack", np.nan), ("adversary", ""), ("failed", False), ("ego_first", False)):  # fmt: skip
         if name not in table:
             table[name] = otherwise
+    for name in ("mission", "family", "planner", "adversary"):
+        table[name] = table[name].astype(object)  # plain texts: grouping by them is what happens most
     broken = table["error"].notna() & (table["error"].astype(str) != "")
     for name in ("intercepted", "completed", "failed", "ego_first"):
         table[name] = table[name].astype(bool)
@@ -89,7 +91,8 @@ def slack_bin(slack: float) -> str | None:
 
 def order(names: Sequence[str] | set[str] | pd.Series, known: Sequence[str]) -> list[str]:
     """Each once, in the order of `known`, strangers last by name."""
-    return sorted(set(names), key=lambda n: (known.index(n) if n in known else len(known), n))
+    once = names.unique() if isinstance(names, pd.Series) else set(names)
+    return sorted(once, key=lambda n: (known.index(n) if n in known else len(known), n))
 
 
 def cells(table: pd.DataFrame) -> Iterator[tuple[str, str, dict[str, pd.DataFrame]]]:
@@ -201,11 +204,13 @@ def survival_curves(table: pd.DataFrame, event: str = "completed") -> dict[Key, 
     return found
 
 
-def restricted_means(table: pd.DataFrame) -> pd.DataFrame:
-    """Per family, mission and planner: mean seconds to interception, counted up to the mission's median horizon."""
+def restricted_means(table: pd.DataFrame, met: Mapping[Key, Curve] | None = None) -> pd.DataFrame:
+    """Per family, mission and planner: mean seconds to interception, counted up to the mission's median horizon.
+
+    `met`: the curves of `survival_curves`, where they are there already.
+    """
     found = []
-    curves = survival_curves(table, "met")
-    for (family, mission, planner), curve in curves.items():
+    for (family, mission, planner), curve in (met or survival_curves(table, "met")).items():
         if mission == ALL:
             continue
         kind = table[(table["family"] == family) & (table["mission"] == mission)]
