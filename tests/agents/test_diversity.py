@@ -202,4 +202,5 @@ def test_samples_of_the_field_are_measured_like_anybody(seen) -> None:
     assert (samples.figures["time used / allowed"] <= 1.1).all()
     for d in range(2):
         for y, path in zip(few, samples.paths[d], strict=True):
-            assert any(y.task.scenario.place(p).contains(path[-1:])[0] for p in y.task.mission.goals[-1].places)
+            ends = [y.task.scenario.place(p).distance(path[-1:])[0] for p in y.task.mission.goals[-1].places]
+            assert min(ends) < 0.1, "within a cell of the goal"

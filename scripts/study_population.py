@@ -1,0 +1,60 @@
+"""The page of the zoo: ``python scripts/study_population.py`` writes the tables and pictures of docs/adversaries/zoo.md."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.progress import Progress
+
+from tab_marl.agents.release import release_moves
+from tab_marl.agents.zoo import SHIPPED, load_zoo
+from tab_marl.evaluation import population_figures as figures
+from tab_marl.evaluation import population_study as tables
+
+app = typer.Typer(add_completion=False)
+MAPS = (("M1", "ambiguous"), ("M4", "point"))
+
+
+@app.command()
+def page(
+    zoo: Annotated[Path, typer.Option(help="Folder of the policies.")] = SHIPPED,
+    tasks: Annotated[int, typer.Option(min=15, help="Held-out tasks that everybody plays, twice.")] = 150,
+    docs: Path = Path("docs"),
+) -> None:
+    """Let every policy, the scripted follower and the field do the same tasks; write tables and pictures."""
+    policies = load_zoo(zoo)
+    with Progress() as bar:
+        done = bar.add_task("", total=len(policies) + 3)
+        study = tables.conduct(policies, tasks, lambda what: bar.update(done, advance=1, description=what))
+    found = {
+        "population": tables.population_lines(study),
+        "success": tables.success_table(policies),
+        "styles": tables.style_table(policies),
+        "behaviour": tables.behaviour_table(study),
+    }
+    path = docs / "adversaries" / "zoo.md"
+    path.write_text(tables.put_tables(path.read_text(encoding="utf-8"), found), encoding="utf-8")
+    images = docs / "images"
+    figures.draw_figures(study, images / "zoo-figures.svg")
+    for mission, family in MAPS:
+        y = next(
+            y
+            for y in study.sheet.yardsticks
+            if (y.task.mission_id, y.task.family) == (mission, family)
+            and y.task.slack >= 1.6
+            and any(y.sides.two_sided(place) for place in y.task.mission.goals[0].places)
+        )
+        figures.draw_paths(study, y, images / f"zoo-paths-{mission}.png")
+    print(found["population"])
+
+
+@app.command()
+def moves(zoo: Annotated[Path, typer.Option(help="Folder of the policies.")] = SHIPPED) -> None:
+    """Count anew what MLE-POMCP knows before an episode, from the policies for development."""
+    print(release_moves(load_zoo(zoo, split="development"), zoo / "moves.json"))
+
+
+if __name__ == "__main__":
+    app()
