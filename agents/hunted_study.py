@@ -1,5 +1,5 @@
-"""What being hunted does to a policy: the share of missions completed against live egos on held-out tasks, under the habits
-that it learned, under even ones, and without any."""
+"""What being hunted does: the share of missions completed against live egos on held-out tasks, habit by habit, and so under any
+mixture of them."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from tab_marl.agents.planner_memory import PlannerMemory
 from tab_marl.agents.planners import PlannerOptions
 from tab_marl.agents.rollouts import run_bank
 from tab_marl.agents.training_env import HELD_OUT, build_bank, draw_tasks
-from tab_marl.agents.validation import wilson
 from tab_marl.agents.zoo import ZooPolicy
 from tab_marl.envs.styles import STYLES, Style
 from tab_marl.mission.tasks import MISSION_IDS, Task
 
 TURN_RADIANS = 0.3
 """A way that turns less than this about the arena's centre takes neither side."""
+RESAMPLES = 4000
 BLOCK = 20
 """Tasks played side by side, and whose fields are kept."""
 
@@ -43,9 +43,9 @@ class HuntedRow:
     """Until the mission was completed or failed, or the adversary was caught."""
 
 
-def styles_of(policy: ZooPolicy) -> dict[str, Style]:
-    """The policy's own style beside the even mixture of the same habits, and none at all."""
-    return {"learned": policy.style, "even": STYLES["habits"], "direct": STYLES["direct"]}
+def habits_of(policy: ZooPolicy) -> dict[str, tuple[ZooPolicy, Style]]:
+    """The policy under each of the even mixture's habits, by the habit's name: what `study` plays."""
+    return {habit.style.name: (policy, habit.style) for habit in STYLES["habits"].mixture}
 
 
 def study(
@@ -85,12 +85,49 @@ def study(
     return rows
 
 
-def shares(rows: Sequence[HuntedRow]) -> dict[tuple[str, str], tuple[int, int, float, float]]:
-    """(policy, ego) -> completed, episodes, and the 95 % Wilson interval of the share."""
-    found: dict[tuple[str, str], list[bool]] = {}
-    for row in rows:
-        found.setdefault((row.policy, row.ego), []).append(row.completed)
-    return {cell: (sum(done), len(done), *wilson(sum(done), len(done))) for cell, done in found.items()}
+@dataclass(frozen=True)
+class Value:
+    """A mixture's chance of completing its mission against one ego."""
+
+    share: float
+    low: float
+    high: float
+    """95 % interval, bootstrapped over tasks."""
+    gain: float
+    """Over the even mixture, on the same episodes."""
+    gain_low: float
+    gain_high: float
+
+
+def values(rows: Sequence[HuntedRow], mixtures: Mapping[str, Style], seed: int = 0) -> dict[tuple[str, str], Value]:
+    """(mixture, ego) -> what the mixture completes, from episodes under each habit on the same tasks.
+
+    `rows` are those of `habits_of`; a mixture's share on a task is the weighted mean over its habits' episodes there, which
+    is less noisy than drawing the habits anew. Tasks that were not played under every habit are left out.
+    """
+    names = [habit.style.name for habit in STYLES["habits"].mixture]
+    even = np.full(len(names), 1.0 / len(names))
+    found: dict[tuple[str, str], Value] = {}
+    for ego in sorted({row.ego for row in rows}):
+        done = {(row.task, row.policy): float(row.completed) for row in rows if row.ego == ego}
+        tasks = [t for t in sorted({task for task, _ in done}) if all((t, name) in done for name in names)]
+        table = np.array([[done[t, name] for name in names] for t in tasks])
+        resampled = np.random.default_rng(seed).integers(len(tasks), size=(RESAMPLES, len(tasks)))
+        for mixture, style in mixtures.items():
+            share = table @ _over(style, names)
+            gain = share - table @ even
+            low, high = np.quantile(share[resampled].mean(axis=1), (0.025, 0.975))
+            least, most = np.quantile(gain[resampled].mean(axis=1), (0.025, 0.975))
+            found[mixture, ego] = Value(*(float(x) for x in (share.mean(), low, high, gain.mean(), least, most)))
+    return found
+
+
+def _over(style: Style, names: Sequence[str]) -> NDArray[np.float64]:
+    """A style's weights where the goal is open, in the order of these habits."""
+    if not style.mixture:
+        return np.array([float(name == style.name) for name in names])
+    weights = {habit.style.name: habit.open_weight for habit in style.mixture}
+    return np.array([weights.get(name, 0.0) for name in names])
 
 
 def entropy_bits(style: Style, open_ended: bool = True) -> float:

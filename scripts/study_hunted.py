@@ -1,10 +1,9 @@
-"""What being hunted does: completion against live planners on held-out tasks, of policies under the habits that they learned,
-under even ones, and under none.
+"""What being hunted does: completion against live planners on held-out tasks, habit by habit, and under learned mixtures.
 
-    python scripts/study_hunted.py --episodes 120 hunted-fp hunted-tab
+    python scripts/study_hunted.py --episodes 60 runs/population/hunted-fp/policy runs/population/hunted-tab/policy
 
-Writes a row per episode to docs/adversaries/hunted.csv (rows that are there already are kept), and draws
-docs/images/hunted.svg. Every row depends on its task, policy, habits and ego alone.
+The first policy plays every habit; the mixtures are those of all policies named. Rows go to docs/adversaries/hunted.csv (what
+stands there is kept and not played again), the figure to docs/images/hunted.svg.
 """
 
 from __future__ import annotations
@@ -23,18 +22,19 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from tab_marl.agents.hunted_study import HuntedRow, entropy_bits, shares, study, styles_of, unhunted
+from tab_marl.agents.hunted_study import HuntedRow, entropy_bits, habits_of, study, unhunted, values
 from tab_marl.agents.zoo import find_policy, load_policy
+from tab_marl.envs.styles import STYLES, Style
 
 ROOT = Path(__file__).resolve().parent.parent
 ROWS = ROOT / "docs" / "adversaries" / "hunted.csv"
 FIGURE = ROOT / "docs" / "images" / "hunted.svg"
-COLOURS = {"direct": "#7f7f7f", "even": "#9ecae1", "learned": "#d62728"}
+COLOURS = ("#1f77b4", "#d62728", "#7f7f7f")
 
 
 def main(
     policies: Annotated[list[str], typer.Argument(help="Zoo names, or folders of policies.")],
-    episodes: Annotated[int, typer.Option(help="Per policy, habits and ego.")] = 120,
+    episodes: Annotated[int, typer.Option(help="Tasks: one episode per habit and ego on each.")] = 60,
     egos: Annotated[str, typer.Option(help="Comma-separated.")] = "FP-POMCP,TAB-POMCP",
     family: str = "ambiguous",
     seed: int = 4242,
@@ -42,24 +42,22 @@ def main(
     rows: Annotated[Path, typer.Option(help="CSV file.")] = ROWS,
 ) -> None:
     console = Console()
-    players = {}
-    for i, given in enumerate(policies):
-        policy = load_policy(given) if Path(given).is_dir() else find_policy(given)
-        for kind, style in styles_of(policy).items():
-            # The others' weights differ from the first one's by their seed alone.
-            if i == 0 or kind == "learned":
-                players[f"{policy.name}, {kind}"] = (policy, style)
-    for name, (policy, style) in players.items():
-        console.print(f"{name}: {entropy_bits(style):.2f} bits; unopposed {unhunted(policy, style, family, 100, seed)}")
+    found = [load_policy(given) if Path(given).is_dir() else find_policy(given) for given in policies]
+    known = {(row.ego, row.task) for row in _read(rows) if (row.family, row.sees_ego) == (family, seen_metres > 0)}
 
     def keep(block: list[HuntedRow]) -> None:
         _append(block, rows)
-        console.print(f"task {block[-1].task + 1} of {episodes}")
+        console.print(f"{block[-1].ego}: task {block[-1].task + 1} of {episodes}")
 
-    study(players, family, episodes, egos.split(","), seed, seen_metres, on_block=keep)
-    everything = _read(rows)
-    console.print(_table(everything))
-    _draw(everything)
+    for ego in egos.split(","):
+        if (ego, episodes - 1) not in known:
+            study(habits_of(found[0]), family, episodes, [ego], seed, seen_metres, on_block=keep)
+    mixtures = {"direct": STYLES["direct"], "even": STYLES["habits"]} | {policy.name: policy.style for policy in found}
+    for name, style in mixtures.items():
+        console.print(f"{name}: {entropy_bits(style):.2f} bits, {unhunted(found[0], style, family, 100, seed)}")
+    played = [row for row in _read(rows) if (row.family, row.sees_ego) == (family, seen_metres > 0)]
+    console.print(_table(played, mixtures))
+    _draw(played, mixtures)
 
 
 def _append(rows: list[HuntedRow], path: Path) -> None:
@@ -90,41 +88,39 @@ def _read(path: Path) -> list[HuntedRow]:
         ]  # fmt: skip
 
 
-def _table(rows: list[HuntedRow]) -> Table:
-    table = Table("policy", "ego", "family", "sees the ego", "completed", "episodes", "95 %")
-    groups = sorted({(row.family, row.sees_ego) for row in rows})
-    for family, sees in groups:
-        mine = [row for row in rows if (row.family, row.sees_ego) == (family, sees)]
-        for (policy, ego), (done, n, low, high) in sorted(shares(mine).items()):
-            table.add_row(
-                policy, ego, family, "yes" if sees else "no", f"{100 * done / n:.1f} %", str(n),
-                f"{100 * low:.1f} to {100 * high:.1f}",
-            )  # fmt: skip
+def _table(rows: list[HuntedRow], mixtures: dict[str, Style]) -> Table:
+    table = Table("habits", "ego", "completed, %", "95 %", "over even", "95 %")
+    for (name, ego), value in values(rows, mixtures).items():
+        table.add_row(
+            name, ego, f"{100 * value.share:.1f}", f"{100 * value.low:.1f} to {100 * value.high:.1f}",
+            f"{100 * value.gain:+.1f}", f"{100 * value.gain_low:+.1f} to {100 * value.gain_high:+.1f}",
+        )  # fmt: skip
     return table
 
 
-def _draw(rows: list[HuntedRow]) -> None:
-    """Completed missions by policy, habits and ego, blind adversaries, where the goal is open."""
-    cells = shares([row for row in rows if row.family == "ambiguous" and not row.sees_ego])
-    egos = sorted({ego for _, ego in cells})
-    names = sorted({policy.split(", ")[0] for policy, _ in cells})
-    figure, axes = plt.subplots(1, len(egos), figsize=(4.2 * len(egos), 3.0), sharey=True, squeeze=False)
-    for axis, ego in zip(axes[0], egos, strict=True):
-        for j, (kind, colour) in enumerate(COLOURS.items()):
-            for i, name in enumerate(names):
-                if (f"{name}, {kind}", ego) not in cells:
-                    continue
-                done, n, low, high = cells[f"{name}, {kind}", ego]
-                share, x = done / n, i + 0.26 * (j - 1)
-                axis.bar(x, 100 * share, 0.24, color=colour, label=kind if i == 0 else None)
-                axis.errorbar(
-                    x, 100 * share, 100 * np.array([[share - low], [high - share]]), color="black", lw=1, capsize=2
-                )  # fmt: skip
-        axis.set_xticks(range(len(names)), names)
-        axis.set_title(f"hunted by {ego}", fontsize=10)
+def _draw(rows: list[HuntedRow], mixtures: dict[str, Style]) -> None:
+    """Completed missions habit by habit, and under the mixtures."""
+    egos = sorted({row.ego for row in rows})
+    names = [habit.style.name for habit in STYLES["habits"].mixture]
+    single = values(rows, {name: habit.style for name, habit in zip(names, STYLES["habits"].mixture, strict=True)})
+    mixed = values(rows, mixtures)
+    figure, axes = plt.subplots(1, 2, figsize=(9.6, 3.6), sharex=True, gridspec_kw={"width_ratios": [1.2, 1]})
+    for axis, labels, cells, title in (
+        (axes[0], names, single, "one habit"),
+        (axes[1], list(mixtures), mixed, "mixtures"),
+    ):
+        for i, ego in enumerate(egos):
+            y = np.arange(len(labels)) + 0.36 * (i - 0.5 * (len(egos) - 1))
+            shares = np.array([100 * cells[label, ego].share for label in labels])
+            ends = np.array([[100 * cells[label, ego].low, 100 * cells[label, ego].high] for label in labels]).T
+            axis.barh(y, shares, 0.34, color=COLOURS[i % len(COLOURS)], label=f"hunted by {ego}")
+            axis.hlines(y, ends[0], ends[1], color="black", lw=1)
+        axis.set_yticks(range(len(labels)), labels)
+        axis.invert_yaxis()
+        axis.set_title(title, fontsize=10)
+        axis.set_xlabel("missions completed before being caught, %")
         axis.spines[["top", "right"]].set_visible(False)
-    axes[0][0].set_ylabel("missions completed, %")
-    axes[0][-1].legend(title="habits", frameon=False, fontsize=8, title_fontsize=8)
+    axes[1].legend(frameon=False, fontsize=8)
     figure.tight_layout()
     FIGURE.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(FIGURE, metadata={"Date": None})

@@ -13,7 +13,7 @@ from scipy.stats import chisquare
 
 from tab_marl.agents.adversaries import ScriptedAdversary
 from tab_marl.agents.habits import HabitSettings, MixtureLearner, learn_habits, learned_style, with_weights
-from tab_marl.agents.hunted_study import entropy_bits, shares, study, unhunted
+from tab_marl.agents.hunted_study import HuntedRow, entropy_bits, habits_of, study, unhunted, values
 from tab_marl.agents.training_env import HELD_OUT, draw_tasks
 from tab_marl.agents.zoo import load_zoo
 from tab_marl.envs.adversary_observation import AdversaryTask
@@ -152,11 +152,34 @@ def test_the_study_of_hunted_policies() -> None:
     rows = study(players, "ambiguous", 3, ["pursue"], 5, on_block=lambda block: blocks.append(len(block)))
     assert len(rows) == sum(blocks) == 6
     assert rows == study(players, "ambiguous", 3, ["pursue"], 5)
-    done, n, low, high = shares(rows)["a", "pursue"]
-    assert n == 3 and low <= done / n <= high
-    assert done == sum(row.completed for row in rows if row.policy == "a")
+    assert not any(row.completed and row.caught for row in rows)
+    assert list(habits_of(policy)) == [habit.style.name for habit in STYLES["habits"].mixture]
     # Against itself the direct style goes the same way.
     alike = unhunted(policy, STYLES["direct"], "ambiguous", 5, 5, draws=1)
     assert alike.same_last_goal == 1.0
     assert alike.stretch == pytest.approx(1.0, abs=0.3)
     assert entropy_bits(THREE) == pytest.approx(-(0.1 * np.log2(0.1) + 0.2 * np.log2(0.2) + 0.7 * np.log2(0.7)))
+
+
+def test_a_mixtures_value_is_the_weighted_mean_of_its_habits_on_the_same_tasks() -> None:
+    names = [habit.style.name for habit in STYLES["habits"].mixture]
+    rng = np.random.default_rng(0)
+    table = rng.random((50, len(names))) < np.linspace(0.1, 0.9, len(names))
+    rows = [
+        HuntedRow(name, name, "pursue", "M1", "ambiguous", task, False, bool(table[task, k]), not table[task, k], 1.0)
+        for task in range(50)
+        for k, name in enumerate(names)
+    ]
+    rows.append(HuntedRow("direct", "direct", "pursue", "M1", "ambiguous", 50, False, True, False, 1.0))  # left out
+    two = Style("two", mixture=tuple(Habit(Style(names[k]), 1.0 - w, w) for k, w in ((0, 0.25), (5, 0.75))))
+    found = values(rows, {"even": STYLES["habits"], "direct": STYLES["direct"], "two": two})
+    assert found["even", "pursue"].share == pytest.approx(table.mean(), abs=1e-3)
+    assert found["even", "pursue"].gain == pytest.approx(0.0, abs=1e-3)
+    assert found["direct", "pursue"].share == pytest.approx(table[:, 0].mean())
+    share = 0.25 * table[:, 0] + 0.75 * table[:, 5]
+    value = found["two", "pursue"]
+    assert value.share == pytest.approx(share.mean())
+    assert value.gain == pytest.approx(share.mean() - table.mean(), abs=1e-9)
+    # The bootstrap's interval is about that of the normal approximation.
+    half = 1.96 * share.std() / np.sqrt(50)
+    assert value.high - value.low == pytest.approx(2 * half, rel=0.15)
