@@ -50,7 +50,7 @@ class Population:
         Raises TrainingError that names file, member and field.
         """
         path = Path(file)
-        if not path.exists() and (FOLDER / f"{path.name.removesuffix('.toml')}.toml").exists():
+        if not path.is_file() and (FOLDER / f"{path.name.removesuffix('.toml')}.toml").exists():
             path = FOLDER / f"{path.name.removesuffix('.toml')}.toml"
         return cls.from_mapping(read_toml(path), str(file), path.stem)
 
