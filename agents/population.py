@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tab_marl.agents.training_hyperparameters import HyperparameterError, check
 from tab_marl.agents.training_settings import TrainingError, TrainingSettings, as_toml, read_toml
 from tab_marl.envs.styles import STYLES, Style, mixture_of
 from tab_marl.world.scenario import UnknownName
@@ -92,6 +93,14 @@ class Population:
             if name not in known:
                 raise TrainingError(f"{self.source}: {UnknownName('member', name, known)}")
         return dataclasses.replace(self, members=tuple(m for m in self.members if m.name in names))
+
+    def check(self) -> None:
+        """Whether every member's algorithm takes its hyperparameters. Raises TrainingError; imports torch."""
+        for member in self.members:
+            try:
+                check(member.algorithm, member.hyperparameters)
+            except HyperparameterError as error:
+                raise TrainingError(f"{self.source}: {member.name}: {error}") from None
 
     def command(self, member: TrainingSettings) -> str:
         """What trains this member again."""

@@ -89,6 +89,7 @@ def train_many(
     if steps is not None:
         with user_input():
             population = replace(population, members=tuple(replace(m, steps=steps) for m in population.members))
+    population.check()
     folder = out if out is not None else Path("runs/train") / population.name
     count = workers if workers is not None else min(os.cpu_count() or 1, len(population.members))
     began = time.monotonic()

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import multiprocessing
 import os
 import re
 import signal
+import tomllib
 from dataclasses import replace
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -126,8 +129,29 @@ def test_an_unknown_member_is_answered_with_the_nearest(tmp_path):
         population.only(["sied"])
 
 
+def test_hyperparameters_are_checked_before_anything_is_trained(tmp_path):
+    path = written(tmp_path, "[[member]]\nstyle = 'side'\nhyperparameters = { learning_rat = 1.0 }")
+    with pytest.raises(TrainingError, match=r"population.toml: side: PPO has no .*did you mean 'learning_rate'"):
+        train_many(path, None, 1, None, tmp_path / "runs", Console())
+    assert not (tmp_path / "runs").exists()
+
+
+def test_the_page_shows_a_population_that_loads():
+    page = (Path(__file__).parents[2] / "docs" / "adversaries" / "training.md").read_text()
+    (shown,) = re.findall(r"```toml\n(.*?)```", page, flags=re.DOTALL)
+    population = Population.from_mapping(tomllib.loads(shown), "page")
+    population.check()
+    assert [m.name for m in population.members] == ["side", "quiet-1", "quiet-2", "moody", "control-1", "control-2"]
+    fields = set(
+        re.findall(r"`(\w+)`", "".join(line.split("|")[1] for line in page.splitlines() if line.startswith("| `")))
+    )
+    known = {f.name for f in dataclasses.fields(TrainingSettings)}
+    assert known - {"checkpoint_seconds"} <= fields, "every field of the settings is on the page"
+
+
 def test_the_shipped_population_holds_every_style_in_both_splits_and_six_algorithms():
     population = Population.load("shipped")
+    population.check()
     assert population.source == "shipped" and (FOLDER / "shipped.toml").exists()
     shipped = [m for m in population.members if m.name not in population.controls]
     assert len(shipped) >= 16 and len(population.controls) >= 2
