@@ -171,21 +171,31 @@ def measured(
     return Behaviour(name, figures, completed, paths, drawn)
 
 
+OWN_FIGURE: dict[str, tuple[str, Literal[1, -1]]] = {
+    "late": ("time used / allowed", 1),
+    "contrary": ("shortest side", -1),
+    "side": ("side as drawn", 1),
+    "via": ("via points reached", 1),
+    "camera-shy": ("seconds in other cameras", -1),
+    "wander": (SPREAD, 1),
+    "fickle": ("places of the shortest way", -1),
+}
+"""What the styles that have a name are there to move, and the direction."""
+
+
 def own_figure(style: Style) -> tuple[str, Literal[1, -1]] | None:
-    """The figure that a style is there to move, and the direction; None: it has none (the direct style)."""
-    if style.mixture:
-        return SPREAD, 1
-    if style.arrival_fraction is not None:
-        return "time used / allowed", 1
-    if style.side:
-        return "side as drawn", 1
-    if style.via:
-        return "via points reached", 1
-    if style.camera_shy:
-        return "seconds in other cameras", -1
-    if style.edge_noise:
-        return SPREAD, 1
-    return ("places of the shortest way", -1) if style.order_metres >= SOFT_ORDER_METRES else None
+    """The figure that a style is there to move, and the direction; None: it has none (the direct style).
+
+    By the style's name, where it is one of those in OWN_FIGURE, else by what it holds.
+    """
+    if style.name in OWN_FIGURE:
+        return OWN_FIGURE[style.name]
+    held = (
+        ("wander", bool(style.mixture)), ("late", style.arrival_fraction is not None), ("contrary", style.contrary > 0),
+        ("side", style.side > 0), ("via", style.via > 0), ("camera-shy", style.camera_shy > 0),
+        ("wander", style.edge_noise > 0), ("fickle", style.order_metres >= SOFT_ORDER_METRES),
+    )  # fmt: skip
+    return next((OWN_FIGURE[name] for name, holds in held if holds), None)
 
 
 def style_test(mine: Behaviour, controls: Sequence[Behaviour], style: Style, seed: int = 0) -> StyleTest | None:

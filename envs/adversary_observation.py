@@ -166,13 +166,14 @@ def _styled(plain: _Plain, latents: Latents) -> Parts:
     if not latents.bends_route:
         return plain.parts(latents, 1.0)
     rng = np.random.default_rng(latents.seed + 1)
+    shortest = grid.centres[plain.route.path(home, scenario.adversary_start.centre)[0]]
     dear = {name: float(rng.uniform(0, latents.order_metres)) for name in plain.automaton.branch_places}
     for strength in STRENGTHS:
         via = _via_points(rng, plain, latents.via_points, strength)
         route = solve_route(
             plain.automaton,
             grid,
-            styled_cost(scenario, grid, plain.clearance, latents, strength),
+            styled_cost(scenario, grid, plain.clearance, latents, strength, shortest),
             place_metres={name: strength * metres for name, metres in dear.items()},
             via=via,
             via_location=home,

@@ -23,6 +23,8 @@ from tab_marl.agents.diversity import (
     style_test,
 )
 from tab_marl.agents.homotopy import Sides, winding_number
+from tab_marl.agents.rollouts import run_bank
+from tab_marl.agents.training_env import build_bank
 from tab_marl.agents.validation import HeldOut
 from tab_marl.envs.styles import STYLES
 from tab_marl.mission import parse_mission
@@ -79,6 +81,16 @@ def test_which_side_a_way_takes() -> None:
     # Goes to the other side, thinks better of it, and comes back.
     back = walk((0.4, 1.4), (1.2, 1.9), (1.0, 1.4), (1.3, 1.0), (1.7, 1.0), (2.6, 1.4))
     assert sides.took_shortest(back, "Checkpoint D") == 1.0
+
+
+def test_a_contrary_adversary_takes_the_other_side() -> None:
+    """Where there is one; the style is in the route, so a script that follows it shows it."""
+    y = Yardstick.of(task())
+    for name, expected in (("direct", 1.0), ("contrary", 0.0)):
+        bank = build_bank([y.task], STYLES[name], 0)
+        rollouts = run_bank(ScriptedAdversary(STYLES[name]), bank, np.array([0]), np.random.default_rng(0))
+        path = rollouts.positions[0, : rollouts.end[0] + 1].astype(np.float64)
+        assert rollouts.completed[0] and y.sides.took_shortest(path, "Checkpoint D") == expected
 
 
 def test_there_are_no_two_sides_without_room_time_or_reason() -> None:
