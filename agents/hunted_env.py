@@ -120,11 +120,11 @@ class HuntedVecEnv(VecEnv):
 
     def _begin(self, which: NDArray[np.int64]) -> None:
         chosen = self.rng.choice(len(self.weights), size=len(which), p=self.weights)
-        for i, k in zip(which, chosen, strict=True):
+        for i, k in zip(which.tolist(), chosen.tolist(), strict=True):
             self._start[i] = draw_starts(self._tasks[k].scenario, self.rng)
             self._hunter[i] = self.rng.integers(len(self.hunters.names))
             self._seed[i] = self.rng.integers(SEEDS)
-            self._learned[i] = self.hunters.begin(i, self._hunter[i], self._tasks[k], int(self._seed[i]))
+            self._learned[i] = self.hunters.begin(i, int(self._hunter[i]), self._tasks[k], int(self._seed[i]))
         self._place(which, chosen)
 
     def _place(self, which: NDArray[np.int64], tasks: NDArray[np.int64]) -> None:
@@ -211,9 +211,9 @@ class HuntedVecEnv(VecEnv):
         for now in range(last + 1):
             # Each arena begins so late that all stand where they stood after the last round.
             which = np.flatnonzero(last - steps == now)
-            for i in which:
+            for i in which.tolist():
                 self.hunters.begin(
-                    i, self._hunter[i], self._tasks[task[i]], int(self._seed[i]), self._learned[i]
+                    i, int(self._hunter[i]), self._tasks[int(task[i])], int(self._seed[i]), self._learned[i]
                 )  # fmt: skip
             if len(which):
                 self._place(which, task[which])
