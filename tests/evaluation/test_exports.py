@@ -110,7 +110,7 @@ def test_film_shows_robots_belief_and_field(data, tmp_path):
     trace = group["episodes"][0]["trace"]
     assert episode_film._state(trace, 1.0)[0] == "a camera sees the adversary"
     assert episode_film._state(trace, 1.6) == ("intercepted at 1.5 s", "goal")
-    (path,) = episode_film.export_films([group], tmp_path, "gif")
+    (path,) = episode_film.export_films([group], tmp_path, ("gif",))
     assert path.name == "M1-point-episode-0.gif" and path.stat().st_size > 1000
 
 

@@ -40,14 +40,15 @@ def check_kind(folder: Path, kind: str) -> None:
     check_target(folder / f"film.{kind}")
 
 
-def export_films(groups: Sequence[Mapping[str, Any]], folder: Path, kind: str) -> list[Path]:
-    """A film ("gif" or "mp4") of every replay; returns the files. Raises UserError before drawing if it cannot be made."""
+def export_films(groups: Sequence[Mapping[str, Any]], folder: Path, kinds: Sequence[str]) -> list[Path]:
+    """A film of every replay in every kind ("gif", "mp4"); returns the files. Raises UserError if one cannot be written."""
     written = []
     for group in groups:
-        path = folder / f"{re.sub('[^A-Za-z0-9]+', '-', group['title']).strip('-')}.{kind}"
-        check_target(path)
-        write_film(film_frames(group), path, FRAMES_PER_SECOND)
-        written.append(path)
+        frames = list(film_frames(group))
+        for kind in kinds:
+            path = folder / f"{re.sub('[^A-Za-z0-9]+', '-', group['title']).strip('-')}.{kind}"
+            write_film(frames, path, FRAMES_PER_SECOND)
+            written.append(path)
     return written
 
 
@@ -89,6 +90,7 @@ class _Pictures:
     def __init__(self, frames: Sequence[Sequence[Any]], shape: tuple[int, int]) -> None:
         self._frames, self._shape = frames, shape
         self._at, self._levels = -1, np.zeros(shape, dtype=np.uint8)
+        self._dots: tuple[int, Image.Image] | None = None
 
     def at(self, step: int) -> NDArray[np.uint8]:
         """Levels ``[rows, columns]`` that hold at a step, row 0 at the top."""
@@ -96,6 +98,21 @@ class _Pictures:
         if self._frames and index != self._at:
             self._at, self._levels = index, decode_image(self._frames[index][1], self._shape)[::-1]
         return self._levels
+
+    def dots(self, step: int, size: tuple[int, int]) -> Image.Image:
+        """The levels as dots, larger where there is more: a mask ``[height, width]``, drawn once for all panels."""
+        levels = self.at(step)
+        if self._dots is None or self._dots[0] != self._at:
+            mask = Image.new("L", size)
+            draw = ImageDraw.Draw(mask)
+            (rows, columns), (width, height) = levels.shape, size
+            across, down = width / columns, height / rows
+            for row, column in zip(*np.nonzero(levels), strict=True):
+                radius = min(across, down) * (0.06 + 0.28 * levels[row, column] / BELIEF_LEVELS)
+                x, y = (column + 0.5) * across, (row + 0.5) * down
+                draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=255)
+            self._dots = self._at, mask
+        return self._dots[1]
 
 
 def _font(size: int) -> Any:
@@ -117,7 +134,7 @@ def _panel(
     levels = beliefs.at(step)
     if levels.size:
         opacity = Image.fromarray((levels * (225 // BELIEF_LEVELS)).astype(np.uint8)).resize((width, height), Image.Resampling.BILINEAR)  # fmt: skip
-        picture.paste(Image.new("RGB", (width, height), COLOURS["heat"]), mask=opacity)
+        picture.paste(COLOURS["heat"], mask=opacity)
     draw = ImageDraw.Draw(picture)
 
     def at(x: float, y: float) -> tuple[float, float]:
@@ -147,7 +164,7 @@ def _panel(
     for obstacle in world["obstacles"]:
         region(obstacle, fill=COLOURS["solid"])
     if fields is not None:
-        _dots(draw, fields.at(step), width, height)
+        picture.paste(COLOURS["field"], mask=fields.dots(step, (width, height)))
     index = min(step, len(trace["poses"][0]) - 1)
     for offset, name, radius in ((3, "adversary", world["radii"][1]), (0, "ego", world["radii"][0])):
         xs, ys = (np.array(trace["poses"][offset + k][: index + 1]) / 1000 for k in (0, 1))
@@ -161,15 +178,6 @@ def _panel(
         if name == "ego":
             circle(xs[-1], ys[-1], world["meet"], outline=COLOURS["ego"], width=FINER)
     return picture.resize(size, Image.Resampling.LANCZOS)
-
-
-def _dots(draw: ImageDraw.ImageDraw, levels: NDArray[np.uint8], width: int, height: int) -> None:
-    rows, columns = levels.shape
-    across, down = width / columns, height / rows
-    for row, column in zip(*np.nonzero(levels), strict=True):
-        radius = min(across, down) * (0.06 + 0.28 * levels[row, column] / BELIEF_LEVELS)
-        x, y = (column + 0.5) * across, (row + 0.5) * down
-        draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=COLOURS["field"])
 
 
 def _state(trace: Mapping[str, Any], seconds: float) -> tuple[str, str]:

@@ -90,7 +90,7 @@ def present(
     written = {
         "tables": exports.export_tables(results, folder / "tables", wanted.tables) if wanted.tables else [],
         "figures": plots.export_figures(results, folder / "figures", wanted.figures) if wanted.figures else [],
-        "films": [p for kind in wanted.films for p in episode_film.export_films(groups, folder / "films", kind)],
+        "films": episode_film.export_films(groups, folder / "films", wanted.films) if wanted.films else [],
     }
     for name, files in written.items():
         if files:
