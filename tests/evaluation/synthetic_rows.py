@@ -11,7 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
+from tab_marl.evaluation.engines.interface import Outcome
+from tab_marl.evaluation.engines.local import LocalEngine
 from tab_marl.evaluation.rows import EpisodeRow, Timing
+from tab_marl.evaluation.runner import run
+from tab_marl.evaluation.settings import EvaluationSettings, settings_key
+from tab_marl.evaluation.store import Store
 from tab_marl.evaluation.units import Job, unit_seeds
 
 HORIZON = 6000
@@ -112,32 +117,72 @@ def play_noting(job: Job):
             f"{job.unit.mission} {job.unit.family} {planner} {job.unit.seed} {os.getppid()}\n"
             for planner in job.planners
         )
+    _wait_for_players(int(os.environ.get("SYNTHETIC_PLAYERS", "1")))
     return play_slowly(job)
 
 
-def evaluate_folder(folder: str, episodes: str, workers: str, play: str = "play_slowly") -> None:
-    """A whole evaluation with synthetic episodes, to be run, and killed, as a process of its own."""
-    import synthetic_rows
+def _wait_for_players(count: int) -> None:
+    """Until so many runs have begun to play: one that starts faster must not finish alone."""
+    deadline = time.monotonic() + 90
+    while time.monotonic() < deadline:
+        lines = Path(os.environ["SYNTHETIC_MARKER"]).read_text().splitlines()
+        if len({line.rsplit(" ", 1)[-1] for line in lines}) >= count:
+            return
+        time.sleep(0.02)
 
-    from tab_marl.evaluation.engines.local import LocalEngine
-    from tab_marl.evaluation.runner import run
-    from tab_marl.evaluation.settings import EvaluationSettings, settings_key
-    from tab_marl.evaluation.store import Store
 
+class Inline:
+    """An engine that plays in this process, one job after the other: what every other engine must agree with."""
+
+    name, workers = "inline", 1
+
+    def __init__(self, play):
+        self._play, self._ended = play, []
+
+    @property
+    def room(self):
+        return 0 if self._ended else 1
+
+    def submit(self, ticket, job):
+        self._ended.append(Outcome(ticket, self._play(job)))
+
+    def collect(self, timeout_seconds):
+        ended, self._ended = self._ended, []
+        return ended
+
+    def stop(self):
+        return self.collect(0.0)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+
+def evaluate_with(folder: Path, episodes: int, engine) -> None:
+    """A whole evaluation with synthetic episodes."""
     settings = EvaluationSettings(
         missions=("M1", "M3"),
         families=("point",),
         planners=("S-POMCP", "MLE-POMCP", "TAB-POMCP"),
-        episodes=int(episodes),
+        episodes=episodes,
         seed=7,
     )
-    with Store.create(Path(folder)) as store:
+    with Store.create(folder) as store:
         content = settings.content("code", ("a", "b"))
         key = settings_key(content)
         store.use(key, content, {})
         run_id = store.begin_run(key, {})
-        run(settings, ("a", "b"), store, key, LocalEngine(getattr(synthetic_rows, play), int(workers)), run_id)
+        run(settings, ("a", "b"), store, key, engine, run_id)
         store.end_run(run_id, "finished")
+
+
+def evaluate_folder(folder: str, episodes: str, workers: str, play: str = "play_slowly") -> None:
+    """The same in worker processes, to be run, and killed, as a process of its own."""
+    import synthetic_rows
+
+    evaluate_with(Path(folder), int(episodes), LocalEngine(getattr(synthetic_rows, play), int(workers)))
 
 
 if __name__ == "__main__":
