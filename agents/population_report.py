@@ -201,7 +201,7 @@ def draw(lines: Sequence[Line], missions: Sequence[str], target: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    columns = min(4, len(lines))
+    columns = min(len(lines), 3 if len(lines) <= 6 else 4)
     rows = -(-len(lines) // columns)
     figure = Figure(figsize=(2.7 * columns, 1.9 * rows + 0.5), layout="constrained")
     FigureCanvasAgg(figure)
