@@ -147,14 +147,14 @@ def curve_plot(
 
     parts = [_open(width, height, title)]
     for share in np.linspace(0, top_share, 5):
-        y = float(down(share))
+        level = float(down(share))
         parts.append(
-            f'<line class="grid" x1="{left}" x2="{left + w}" y1="{y:.1f}" y2="{y:.1f}"/>'
-            f'<text class="tick" x="{left - 5}" y="{y + 4:.1f}" text-anchor="end">{100 * share:g}</text>'
+            f'<line class="grid" x1="{left}" x2="{left + w}" y1="{level:.1f}" y2="{level:.1f}"/>'
+            f'<text class="tick" x="{left - 5}" y="{level + 4:.1f}" text-anchor="end">{100 * share:g}</text>'
         )
     for tick in x_ticks or ticks(end):
-        x = left + w * (tick - start) / (end - start)
-        parts.append(f'<text class="tick" x="{x:.1f}" y="{top + h + 15}" text-anchor="middle">{tick:g}</text>')
+        place = left + w * (tick - start) / (end - start)
+        parts.append(f'<text class="tick" x="{place:.1f}" y="{top + h + 15}" text-anchor="middle">{tick:g}</text>')
     parts.append(f'<text class="axis" x="{left + w / 2:.0f}" y="{height - 4}" text-anchor="middle">{x_label}</text>')
     for track in tracks:
         if track.low is not None and track.high is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from tab_marl.evaluation import tables
 from tab_marl.evaluation.errors import UserError
@@ -146,9 +147,10 @@ def _aggregates(results: Results, family: str) -> Table:
     part = results.aggregates[results.aggregates["family"] == family]
     means = results.restricted[results.restricted["family"] == family]
     missions = tables.order(means["mission"], MISSIONS)
-    seconds = {(r.mission, r.planner): r for r in means.itertuples()}
+    seconds: dict[tuple[str, str], Any] = {(str(r.mission), str(r.planner)): r for r in means.itertuples()}
     rows = []
-    for r in part.itertuples():
+    rows_of: Any = part.itertuples()
+    for r in rows_of:
         improvement = f"{r.improvement:.2f}" if r.improvement == r.improvement else ""
         cells = [f"{s.mean_seconds:.1f}" if (s := seconds.get((m, r.planner))) else "" for m in missions]
         rows.append((str(r.planner), str(r.episodes), _text(numbers.score(r.iqm, r.low, r.high)), improvement, *cells))

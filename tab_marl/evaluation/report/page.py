@@ -139,7 +139,7 @@ def _family(name: str, found: Results) -> dict[str, Any]:
     middles = found.aggregates[found.aggregates["family"] == name]
     means = found.restricted[found.restricted["family"] == name]
     missions = tables.order(means["mission"], MISSIONS)
-    seconds = {(r.mission, r.planner): r for r in means.itertuples()}
+    seconds: dict[tuple[str, str], Any] = {(str(r.mission), str(r.planner)): r for r in means.itertuples()}
     until = {m: next(r.until_seconds for (k, _), r in seconds.items() if k == m) for m in missions}
     return {
         "name": name,

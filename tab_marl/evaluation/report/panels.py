@@ -31,7 +31,7 @@ def mission_name(mission: str) -> str:
 def interval_panels(found: Sequence[Line], family: str) -> list[dict[str, Any]]:
     """Per mission: the interval plots of ATCR and StI, the paper's figures beside those of `point`."""
     paper = {key: figure for key, figure in PAPER.items() if family == "point"}
-    shown = [paper[x.mission, x.planner].steps for x in found if (x.mission, x.planner) in paper]
+    shown = [float(paper[x.mission, x.planner].steps) for x in found if (x.mission, x.planner) in paper]
     top = 1.02 * max([x.steps.high for x in found] + shown, default=1.0)
     panels = []
     for mission in dict.fromkeys(x.mission for x in found):
@@ -94,7 +94,8 @@ def profile_plot(profiles: pd.DataFrame, family: str) -> Markup:
 def middle_plot(aggregates: pd.DataFrame, family: str) -> Markup:
     """Interquartile means with intervals."""
     part = aggregates[aggregates["family"] == family]
-    dots = [charts.Dot(r.planner, Interval(r.iqm, r.low, r.high, r.episodes)) for r in part.itertuples()]
+    rows: Any = part.itertuples()
+    dots = [charts.Dot(r.planner, Interval(r.iqm, r.low, r.high, r.episodes)) for r in rows]
     title = f"Interquartile mean of the score, {family}"
     # The planners that compete lie close together: the axis shows them, and says of others where they are.
     close = [d.interval for d in dots if d.planner in PAPER_PLANNERS] or [d.interval for d in dots]

@@ -36,7 +36,7 @@ LOOK: dict[str, tuple[str, str, str]] = {
 """Colour, mark and line of each planner: those of the page. A figure can be read from marks alone."""
 UNKNOWN = ("#333333", "d", "-.")
 
-STYLE = {
+STYLE: dict[Any, Any] = {
     "font.size": 7.5, "axes.titlesize": 8, "axes.labelsize": 7.5, "legend.fontsize": 7, "xtick.labelsize": 7,
     "ytick.labelsize": 7, "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.6,
     "lines.linewidth": 1.2, "lines.markersize": 3.5, "pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "tab-marl",
@@ -112,7 +112,7 @@ def _measures(results: Results, family: str) -> Figure:
 def _curve(axis: Axes, planner: str, x: Any, value: Any, low: Any, high: Any, number: int) -> None:
     colour, mark, line = LOOK.get(planner, UNKNOWN)
     every = (4 * number % max(len(x) // 4, 1), max(len(x) // 4, 1))  # marks of different lines do not meet
-    hollow = {"markerfacecolor": "white"} if planner not in PAPER_PLANNERS else {}
+    hollow: dict[str, Any] = {"markerfacecolor": "white"} if planner not in PAPER_PLANNERS else {}
     axis.plot(
         x, 100 * value, line, color=colour, marker=mark, markevery=every, label=short(planner), clip_on=False, **hollow
     )
@@ -148,8 +148,8 @@ def _profile(results: Results, family: str) -> Figure:
     part = results.profiles[results.profiles["family"] == family]
     for number, planner in enumerate(tables.order(part["planner"], PLANNERS)):
         one = part[part["planner"] == planner]
-        columns = (one[c].to_numpy() for c in ("threshold", "value", "low", "high"))
-        _curve(axes[0, 0], planner, *columns, number)
+        x, value, low, high = (one[c].to_numpy() for c in ("threshold", "value", "low", "high"))
+        _curve(axes[0, 0], planner, x, value, low, high, number)
     axes[0, 0].set(xlabel="score τ = 1 − StI / horizon", ylabel="episodes above τ, %", xlim=(0, 1), ylim=(0, 101))
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, ncols=4, loc="outside upper center")

@@ -60,7 +60,7 @@ def choose(rows: Sequence[EpisodeRow], count: int) -> list[Choice]:
     present = {r.family for r in rows}
     families = [f for f in ("ambiguous", *FAMILIES) if f in present]
     families = list(dict.fromkeys(families + order(present, FAMILIES)))
-    missions = order((r.mission for r in rows), MISSIONS)
+    missions = order([r.mission for r in rows], MISSIONS)
     pairs = sorted(
         ((f, m) for m in missions for f in families),
         key=lambda pair: (missions.index(pair[1]), families.index(pair[0])),

@@ -65,7 +65,7 @@ def _group(choice: Choice, part: Sequence[tuple[Job, Played]], rows: Mapping[Any
     text = to_english(task.mission, task.scenario)
     scene = mission_scene(task.mission, task.scenario, text)
     goals = list(dict.fromkeys(region for stage in scene.stages for region in stage.regions))
-    episodes = []
+    episodes: list[dict[str, Any]] = []
     for _, played in part:
         if played.trace is None:
             continue

@@ -87,7 +87,7 @@ def performance_profile(scores: Scores, thresholds: ArrayLike, seed: int = SEED)
     total = sum(len(s) for s in scores)
 
     def above(sorted_scores: Floats) -> Floats:
-        return len(sorted_scores) - np.searchsorted(sorted_scores, tau, side="right")
+        return np.asarray(len(sorted_scores) - np.searchsorted(sorted_scores, tau, side="right"), dtype=np.float64)
 
     value = above(np.sort(np.concatenate(scores))) / total
     rng = np.random.default_rng(seed)

@@ -134,7 +134,7 @@ def paired(table: pd.DataFrame, baseline: str = HEADLINE, seed: int = SEED) -> d
         group = (family, metric, mission == ALL, planner in REFERENCE_PLANNERS)
         groups.setdefault(group, {})[family, mission, planner, metric] = one.p_value
     for together in groups.values():
-        for key, p in holm(together).items():  # type: ignore[arg-type]
+        for key, p in holm(together).items():
             found[key] = replace(found[key], adjusted=p, comparisons=len(together))  # type: ignore[index]
     return found
 

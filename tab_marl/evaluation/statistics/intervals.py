@@ -56,10 +56,9 @@ def _resampled_means(group: Floats, rng: np.random.Generator) -> Floats:
     """Means ``[RESAMPLES]`` of resamples. Few distinct values (0 and 1, say) are drawn as counts: the same law, faster."""
     values, counts = np.unique(group, return_counts=True)
     if len(values) <= 4:
-        drawn = rng.multinomial(len(group), counts / len(group), size=RESAMPLES)
-        return np.asarray(drawn @ values / len(group))
-    drawn = resampled_places(len(group), RESAMPLES, rng)
-    return np.asarray(group[drawn].mean(axis=1))
+        times = rng.multinomial(len(group), counts / len(group), size=RESAMPLES)
+        return np.asarray(times @ values / len(group))
+    return np.asarray(group[resampled_places(len(group), RESAMPLES, rng)].mean(axis=1))
 
 
 def resampled_places(size: int, count: int, rng: np.random.Generator) -> NDArray[np.integer]:
