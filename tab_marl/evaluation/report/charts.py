@@ -134,8 +134,8 @@ def curve_plot(
     top_share: float = 1.0,
 ) -> str:
     """Shares over x, one line per planner with its marks, `named` at its end; bands as pale areas."""
-    width, height, left, top, foot = 360, 232, 32, 10, 34
-    right = 72 if named else 12
+    width, height, left, top, foot = 370, 232, 32, 10, 34
+    right = 86 if named else 12
     w, h = width - left - right, height - top - foot
     start, end = x_range
 
