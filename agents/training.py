@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -29,10 +30,16 @@ from tab_marl.agents.training_log import LOG_FILE, ROWS, LearningLog
 from tab_marl.agents.training_settings import UNOPPOSED, TrainingError, TrainingSettings
 from tab_marl.mission.tasks import Task
 
+try:
+    import fcntl
+except ImportError:
+    fcntl = None  # type: ignore[assignment]
+
 __all__ = ["CHECKPOINT_FILE", "LOG_FILE", "LOG_FOLDER", "SETTINGS_FILE", "OnProgress", "Progress", "train"]
 
 SETTINGS_FILE = "settings.toml"
 LOG_FOLDER = "tensorboard"
+LOCK_FILE = "lock"
 EXACT_MISSION = "M2"
 NOT_PART_OF_A_RUN = ("checkpoint_seconds", "description", "split")
 """Settings that may differ when a run is continued."""
@@ -64,29 +71,50 @@ def train(settings: TrainingSettings, out_dir: Path | str, on_progress: OnProgre
     Writes ``settings.toml``, ``checkpoint.pt`` (replaced atomically, read back without unpickling code), ``replay/``
     while an off-policy algorithm learns, ``log.csv`` and ``tensorboard/`` in `out_dir`. A finished run returns at once.
 
-    Raises TrainingError if the folder holds a run with other settings or an unreadable checkpoint, or for a
-    hyperparameter that the algorithm does not have; OSError if the folder cannot be written.
+    Raises TrainingError if the folder holds a run with other settings or an unreadable checkpoint, if another process
+    trains there, or for a hyperparameter that the algorithm does not have; OSError if the folder cannot be written.
     """
     folder = Path(out_dir)
     try:
         check(settings.algorithm, settings.hyperparameters)
     except HyperparameterError as error:
         raise TrainingError(str(error)) from None
-    _claim(folder, settings)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # the networks are small: one thread is fastest, and results do not depend on the machine
-    try:
+    folder.mkdir(parents=True, exist_ok=True)
+    with _alone_in(folder), _one_thread():
+        _claim(folder, settings)
         model = _train(settings, folder, on_progress)
         if settings.habits_against:
             _learn_habits(settings, model, folder, on_progress)
         return model
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """The networks are small: one thread is fastest, and results do not depend on the machine."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
     finally:
         torch.set_num_threads(threads)
 
 
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Hold the folder's lock, which the system takes back from a process that dies. Raises TrainingError."""
+    if fcntl is None:  # no such locks on this system
+        yield
+        return
+    with (folder / LOCK_FILE).open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise TrainingError(f"another process trains in {folder}: wait for it, or choose another folder") from None
+        yield
+
+
 def _claim(folder: Path, settings: TrainingSettings) -> None:
     """Write the settings into a new folder, or check that those there are the same."""
-    folder.mkdir(parents=True, exist_ok=True)
     path = folder / SETTINGS_FILE
     if path.exists():
         theirs = TrainingSettings.from_toml(path)

@@ -114,6 +114,21 @@ def test_a_replay_file_that_is_missing_is_noticed(tmp_path):
         train(settings, tmp_path)
 
 
+def test_two_processes_cannot_train_in_one_folder(tmp_path):
+    """The second is refused while the first is at work, and may go on when that has ended."""
+    settings = settings_of("a2c", steps=20 * ROBOTS)
+    refused = []
+
+    def again(stand):
+        with pytest.raises(TrainingError, match="another process trains in") as caught:
+            train(settings, tmp_path)
+        refused.append(caught.value)
+
+    train(settings, tmp_path, again)
+    assert refused
+    train(settings, tmp_path)
+
+
 def test_the_log_has_a_row_per_update(tmp_path):
     settings = settings_of("a2c")
     train(settings, tmp_path)
