@@ -13,8 +13,9 @@ from tab_marl.mission.tasks import MISSION_IDS
 
 Split = Literal["development", "final"]
 """What a policy may be used for: training data and tuning, or the final table alone."""
-DEVELOPMENT, FINAL = "development", "final"
 SPLITS: tuple[Split, ...] = ("development", "final")
+World = Literal["batched", "physics"]
+"""Kinematic, or pymunk."""
 CLAIM = 0.9
 """A mission type is claimed if at least this share of held-out tasks is completed when nobody hunts."""
 
@@ -43,8 +44,7 @@ class MissionRecord(_Part):
 
     mission: Name
     """ "M1" to "M5", or "sampled": compositions that no training draws."""
-    world: Literal["batched", "physics"]
-    """Kinematic, or pymunk."""
+    world: World
     completed: int = Field(ge=0)
     episodes: int = Field(ge=1)
     low: Share

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tab_marl.agents.adversaries import AdversaryPolicy
-from tab_marl.agents.cards import CLAIM, MissionRecord, PolicyCard
+from tab_marl.agents.cards import CLAIM, MissionRecord, PolicyCard, World
 from tab_marl.agents.diversity import FIGURES, SPREAD, Behaviour, Yardstick, behaviour, occupancy_distance, style_test
 from tab_marl.agents.rollouts import run_bank
 from tab_marl.agents.training_env import HELD_OUT, build_bank
@@ -87,7 +87,7 @@ def success(
     sampled: Sequence[Task],
     seed: int = SEED,
     on_played: OnPlayed | None = None,
-    worlds: Sequence[str] = (BATCHED, PHYSICS),
+    worlds: Sequence[World] = (BATCHED, PHYSICS),
 ) -> list[MissionRecord]:
     """Unopposed success per mission type, the sampled compositions together, in each world."""
     every = [*tasks, *sampled]
@@ -109,7 +109,7 @@ def claimed(records: Sequence[MissionRecord]) -> tuple[str, ...]:
     return tuple(m for m in types if all(r.claimable for r in records if r.mission == m))
 
 
-def gap(records: Sequence[MissionRecord], world: str = PHYSICS) -> float:
+def gap(records: Sequence[MissionRecord], world: World = PHYSICS) -> float:
     """Share completed of M1 to M5 together, less that of the sampled compositions; nan if either was not measured."""
     shares = []
     for sampled in (False, True):

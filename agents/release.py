@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from tab_marl.agents.measuring import PHYSICS, Sheet, gap, measured_policy
+from tab_marl.agents.measuring import Sheet, gap, measured_policy
 from tab_marl.agents.pretraining import count_moves, write_moves
 from tab_marl.agents.training_env import TRAINING, draw_tasks
+from tab_marl.agents.validation import PHYSICS
 from tab_marl.agents.zoo import ZooPolicy, load_zoo, save_policy
 from tab_marl.mission.tasks import FAMILIES, MISSION_IDS
 

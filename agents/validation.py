@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tab_marl.agents.adversaries import AdversaryPolicy
-from tab_marl.agents.cards import MissionRecord
+from tab_marl.agents.cards import MissionRecord, World
 from tab_marl.agents.rollouts import Rollouts, run_bank
 from tab_marl.agents.training_env import HELD_OUT, build_bank, draw_tasks
 from tab_marl.envs.adversary_observation import AdversaryTask
@@ -20,7 +20,8 @@ from tab_marl.mission.automaton import UNBOUNDED
 from tab_marl.mission.tasks import Task
 from tab_marl.world.grid import GridMap
 
-BATCHED, PHYSICS = "batched", "physics"
+BATCHED: World = "batched"
+PHYSICS: World = "physics"
 NEVER_MET_METRES = 1e-3
 
 
@@ -55,7 +56,7 @@ class HeldOut:
         return np.array([task.mission_id for task in self.tasks])
 
 
-def mission_records(missions: NDArray[np.str_], completed: NDArray[np.bool_], world: str) -> list[MissionRecord]:
+def mission_records(missions: NDArray[np.str_], completed: NDArray[np.bool_], world: World) -> list[MissionRecord]:
     """Success per mission type with its interval."""
     records = []
     for mission in sorted({str(m) for m in missions}):

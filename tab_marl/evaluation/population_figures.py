@@ -10,7 +10,9 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.patches import Circle, Polygon
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.patches import Circle, Polygon, Rectangle
 from numpy.typing import NDArray
 
 from tab_marl.agents.adversaries import AdversaryPolicy, ScriptedAdversary
@@ -57,7 +59,7 @@ def draw_paths(study: Study, y: Yardstick, target: Path, seed: int = 5) -> None:
         left=0.01, right=0.925, bottom=0.01, top=1 - 0.5 / (1.98 * rows + 0.75), wspace=0.06, hspace=0.16
     )
     bar = figure.colorbar(
-        plt.cm.ScalarMappable(norm=plt.Normalize(0, 1), cmap=TIMES), cax=figure.add_axes((0.94, 0.2, 0.012, 0.6))
+        ScalarMappable(norm=Normalize(0, 1), cmap=TIMES), cax=figure.add_axes((0.94, 0.2, 0.012, 0.6))
     )
     bar.set_label("time used / allowed", fontsize=8)
     bar.ax.tick_params(labelsize=7)
@@ -70,7 +72,7 @@ def draw_map(axis: Any, task: Task) -> None:
     axis.set_xlim(-0.03, scenario.width_metres + 0.03)
     axis.set_ylim(-0.03, scenario.height_metres + 0.03)
     axis.set_aspect("equal")
-    axis.add_patch(plt.Rectangle((0, 0), scenario.width_metres, scenario.height_metres, fc="#fbfbf9", ec=INK, lw=0.8))
+    axis.add_patch(Rectangle((0, 0), scenario.width_metres, scenario.height_metres, fc="#fbfbf9", ec=INK, lw=0.8))
     for constraint in task.mission.beside:
         for place in constraint.places if constraint.avoid else ():
             axis.add_patch(_patch(scenario.place(place), fc="#f3d5d5", ec="#c77", lw=0.5, hatch="////"))
@@ -105,9 +107,9 @@ def _patch(region: Region, **how: Any) -> Any:
         return Circle((region.x, region.y), region.radius, **how)
     if isinstance(region, Box):
         x0, y0, x1, y1 = region.bounds()
-        return plt.Rectangle((x0, y0), x1 - x0, y1 - y0, **how)
+        return Rectangle((x0, y0), x1 - x0, y1 - y0, **how)
     assert isinstance(region, Outline)
-    return Polygon(np.asarray(region.points), closed=True, **how)
+    return Polygon(np.asarray(region.corners), closed=True, **how)
 
 
 def _ways(policy: AdversaryPolicy, y: Yardstick, seed: int) -> list[tuple[Array, float]]:
@@ -185,9 +187,9 @@ def _save(figure: Any, target: Path) -> None:
 
 
 def _fewer_colours(path: Path) -> None:
-    """A palette of 128 colours: the file is a third of the size, and looks the same."""
+    """A palette of 256 colours: the file is a third of the size, and looks the same."""
     from PIL import Image
 
     with Image.open(path) as picture:
-        smaller = picture.convert("RGB").quantize(128)
+        smaller = picture.convert("RGB").quantize(256)
     smaller.save(path, optimize=True)
