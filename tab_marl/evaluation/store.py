@@ -9,7 +9,7 @@ import json
 import os
 import sqlite3
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -196,14 +196,7 @@ class Store:
         found = self._connection.execute(
             f"SELECT mission, family, planner, seed, {', '.join(MEASURED)} FROM timings WHERE settings_key = ?", (key,)
         )
-        nan = float("nan")
-        return {
-            (m, f, p, s): Timing(decisions, *(nan if v is None else v for v in spans[:3]), trace, *(
-                nan if v is None else v for v in spans[3:]))
-            for m, f, p, s, decisions, *spans, trace in (
-                (*row[:8], *row[9:], row[8]) for row in found
-            )
-        }  # fmt: skip
+        return {(m, f, p, s): _timing(values) for m, f, p, s, *values in found}
 
     def learned(self, key: str, mission: str, family: str, planner: str, seed: int) -> str | None:
         """What the planner carried out of this episode; None if nothing, or if the episode is not stored."""
@@ -219,6 +212,12 @@ class Store:
         with _clear_errors(self.path), self._connection:
             self._connection.execute("BEGIN IMMEDIATE")
             yield
+
+
+def _timing(values: Sequence[Any]) -> Timing:
+    """From the columns `MEASURED`; what was not measured is nan there (SQLite has no nan)."""
+    known = dict(zip(MEASURED, values, strict=True))
+    return Timing(**{k: float("nan") if v is None and k != "traceback" else v for k, v in known.items()})
 
 
 def _connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
