@@ -57,16 +57,17 @@ def study(
     seen_metres: float = 0.0,
     options: PlannerOptions | None = None,
     on_block: Callable[[list[HuntedRow]], None] | None = None,
+    first: int = 0,
 ) -> list[HuntedRow]:
     """Every policy against every ego on the same `count` held-out tasks of a family, missions in turn, from the same starts.
 
     `policies`: by name, with the style to play in. `options`: the planners' (default: those of an evaluation). `on_block`
-    is called with the rows of every BLOCK tasks.
+    is called with the rows of every BLOCK tasks. `first`: the task to begin with, where the ones before are known.
     """
     tasks = draw_tasks(HELD_OUT, seed, count, MISSION_IDS, (family,))
     rows: list[HuntedRow] = []
-    for first in range(0, count, BLOCK):
-        block = range(first, min(count, first + BLOCK))
+    for start in range(first, count, BLOCK):
+        block = range(start, min(count, start + BLOCK))
         hunting = replace(options or PlannerOptions(), memory=PlannerMemory())
         before = len(rows)
         for ego in egos:

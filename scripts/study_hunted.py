@@ -3,7 +3,7 @@
     python scripts/study_hunted.py --episodes 60 runs/population/hunted-fp/policy runs/population/hunted-tab/policy
 
 The first policy plays every habit; the mixtures are those of all policies named. Rows go to docs/adversaries/hunted.csv (what
-stands there is kept and not played again), the figure to docs/images/hunted.svg.
+stands there is kept), the table into docs/adversaries/hunted.md, the figure to docs/images/hunted.svg.
 """
 
 from __future__ import annotations
@@ -20,14 +20,16 @@ import matplotlib.pyplot as plt
 import numpy as np
 import typer
 from rich.console import Console
-from rich.table import Table
 
-from tab_marl.agents.hunted_study import HuntedRow, entropy_bits, habits_of, study, unhunted, values
+from tab_marl.agents.hunted_study import HuntedRow, Unhunted, entropy_bits, habits_of, study, unhunted, values
 from tab_marl.agents.zoo import find_policy, load_policy
 from tab_marl.envs.styles import STYLES, Style
 
 ROOT = Path(__file__).resolve().parent.parent
 ROWS = ROOT / "docs" / "adversaries" / "hunted.csv"
+PAGE = ROOT / "docs" / "adversaries" / "hunted.md"
+BEGIN, END = "<!-- study_hunted.py writes from here -->", "<!-- to here -->"
+UNOPPOSED_TASKS = 30
 FIGURE = ROOT / "docs" / "images" / "hunted.svg"
 COLOURS = ("#1f77b4", "#d62728", "#7f7f7f")
 
@@ -43,20 +45,21 @@ def main(
 ) -> None:
     console = Console()
     found = [load_policy(given) if Path(given).is_dir() else find_policy(given) for given in policies]
-    known = {(row.ego, row.task) for row in _read(rows) if (row.family, row.sees_ego) == (family, seen_metres > 0)}
 
     def keep(block: list[HuntedRow]) -> None:
         _append(block, rows)
         console.print(f"{block[-1].ego}: task {block[-1].task + 1} of {episodes}")
 
+    before = [row for row in _read(rows) if (row.family, row.sees_ego) == (family, seen_metres > 0)]
     for ego in egos.split(","):
-        if (ego, episodes - 1) not in known:
-            study(habits_of(found[0]), family, episodes, [ego], seed, seen_metres, on_block=keep)
+        first = 1 + max((row.task for row in before if row.ego == ego), default=-1)
+        study(habits_of(found[0]), family, episodes, [ego], seed, seen_metres, on_block=keep, first=first)
     mixtures = {"direct": STYLES["direct"], "even": STYLES["habits"]} | {policy.name: policy.style for policy in found}
-    for name, style in mixtures.items():
-        console.print(f"{name}: {entropy_bits(style):.2f} bits, {unhunted(found[0], style, family, 100, seed)}")
     played = [row for row in _read(rows) if (row.family, row.sees_ego) == (family, seen_metres > 0)]
-    console.print(_table(played, mixtures))
+    alone = {name: unhunted(found[0], style, family, UNOPPOSED_TASKS, seed) for name, style in mixtures.items()}
+    table = _table(played, mixtures, alone)
+    console.print(table)
+    _write(table)
     _draw(played, mixtures)
 
 
@@ -88,14 +91,44 @@ def _read(path: Path) -> list[HuntedRow]:
         ]  # fmt: skip
 
 
-def _table(rows: list[HuntedRow], mixtures: dict[str, Style]) -> Table:
-    table = Table("habits", "ego", "completed, %", "95 %", "over even", "95 %")
-    for (name, ego), value in values(rows, mixtures).items():
-        table.add_row(
-            name, ego, f"{100 * value.share:.1f}", f"{100 * value.low:.1f} to {100 * value.high:.1f}",
-            f"{100 * value.gain:+.1f}", f"{100 * value.gain_low:+.1f} to {100 * value.gain_high:+.1f}",
-        )  # fmt: skip
-    return table
+def _table(rows: list[HuntedRow], mixtures: dict[str, Style], alone: dict[str, Unhunted]) -> str:
+    """The results as Markdown."""
+    found = values(rows, mixtures)
+    egos = sorted({row.ego for row in rows})
+    tasks = {ego: len({row.task for row in rows if row.ego == ego}) for ego in egos}
+    head = ["habits", "entropy, bits", *(f"hunted by {ego}: completed, % (gain over even)" for ego in egos)]
+    head += ["unopposed, %", "shortest way's side, %", "nearest last goal, %", "length / shortest"]
+    lines = [" | ".join(head), " | ".join("---" for _ in head)]
+    for name, style in mixtures.items():
+        cells = [name, f"{entropy_bits(style):.2f}"]
+        for ego in egos:
+            v = found[name, ego]
+            gain = (
+                "" if name == "even" else f" ({100 * v.gain:+.1f}; {100 * v.gain_low:+.1f} to {100 * v.gain_high:+.1f})"
+            )
+            cells.append(f"{100 * v.share:.1f} [{100 * v.low:.1f}, {100 * v.high:.1f}]{gain}")
+        a = alone[name]
+        cells += [
+            f"{100 * a.completed:.0f}",
+            f"{100 * a.same_side:.0f}",
+            f"{100 * a.same_last_goal:.0f}",
+            f"{a.stretch:.2f}",
+        ]
+        lines.append(" | ".join(cells))
+    played = ", ".join(f"{tasks[ego]} tasks against {ego}" for ego in egos)
+    note = (
+        f"{played}; {len(STYLES['habits'].mixture)} episodes on each, one per habit. In square brackets and after the semicolon: "
+        "95 % intervals, bootstrapped over tasks."
+    )
+    return "\n".join(f"| {line} |" for line in lines) + f"\n\n{note}\n"
+
+
+def _write(table: str) -> None:
+    """Replace the page's table."""
+    text = PAGE.read_text(encoding="utf-8")
+    before, _, rest = text.partition(BEGIN)
+    _, _, after = rest.partition(END)
+    PAGE.write_text(f"{before}{BEGIN}\n\n{table}\n{END}{after}", encoding="utf-8")
 
 
 def _draw(rows: list[HuntedRow], mixtures: dict[str, Style]) -> None:
