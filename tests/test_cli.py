@@ -95,6 +95,10 @@ def test_help_is_quick_and_imports_nothing_heavy():
         (["train", "shipped", "--steps", "-3"], "steps is -3, must be >= 1"),
         (["train", "--workers", "2"], "--only and --workers are for a population"),
         (["zoo", "show", "drect"], "did you mean 'direct'"),
+        (["zoo", "list", "--split", "finl"], "did you mean 'final'"),
+        (["zoo", "add", "none.zip", "--name", "x"], "none.zip is not a model that stable-baselines3 saved"),
+        (["zoo", "add", "none.zip", "--name", "../x"], "name is '../x', must be"),
+        (["evaluate", "--adversaries", "development,final"], "leave one out, or say --mix-splits"),
     ],
 )
 def test_every_mistake_is_one_clear_line(capsys, monkeypatch, tmp_path, arguments, message):
@@ -124,7 +128,7 @@ def test_a_bug_is_named_as_one(capsys, monkeypatch):
     from tab_marl.evaluation import zoo_view
 
     monkeypatch.delenv("TAB_MARL_TRACEBACK", raising=False)
-    monkeypatch.setattr(zoo_view, "zoo_table", lambda: 1 / 0)
+    monkeypatch.setattr(zoo_view, "zoo_table", lambda *_: 1 / 0)
     status, _, err = call(capsys, monkeypatch, "zoo", "list")
     assert status == cli.EXIT_BUG
     assert err == "tab-marl: internal error: ZeroDivisionError: division by zero (TAB_MARL_TRACEBACK=1 shows where)\n"
