@@ -74,7 +74,7 @@ def train_population(
         raise TrainingError(f"workers is {workers}, must be >= 1")
     out = Path(out_dir)
     out.mkdir(parents=True, exist_ok=True)
-    stands: Stands = {m.name: MemberStand(m, out / m.name) for m in population.members}
+    stands = {m.name: stand_of(m, out) for m in population.members}
 
     def tell(name: str, **changes: Any) -> None:
         stands[name] = replace(stands[name], **changes)
@@ -82,8 +82,8 @@ def train_population(
             on_stand(stands[name], stands)
 
     for name, stand in stands.items():
-        if finished(stand.settings, stand.folder):
-            tell(name, status=DONE, steps=stand.settings.steps, cpu_seconds=_logged_seconds(stand.folder))
+        if stand.ended:
+            tell(name)
     # The longest first: else the last worker is left alone with one of them.
     queue = sorted((s for s in stands.values() if not s.ended), key=lambda s: -expected_seconds(s.settings))
     running: dict[Any, tuple[str, Any]] = {}
@@ -167,6 +167,14 @@ def _one_thread() -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+def stand_of(settings: TrainingSettings, out_dir: Path) -> MemberStand:
+    """Where a member stands when nobody trains it: done or waiting."""
+    folder = out_dir / settings.name
+    if not finished(settings, folder):
+        return MemberStand(settings, folder)
+    return MemberStand(settings, folder, DONE, settings.steps, _logged_seconds(folder))
 
 
 def finished(settings: TrainingSettings, folder: Path) -> bool:

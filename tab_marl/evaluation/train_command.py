@@ -80,12 +80,11 @@ def train_many(
     """Train, or continue, the population of a file and write its page; returns whether every member succeeded."""
     from tab_marl.agents.population import Population
     from tab_marl.agents.population_report import write_report
-    from tab_marl.agents.population_run import DONE, FAILED, train_population
+    from tab_marl.agents.population_run import DONE, FAILED, stand_of, train_population
 
     _check_steps(steps)
-    population = Population.load(file)
-    if only:
-        population = population.only(only)
+    whole = Population.load(file)
+    population = whole.only(only) if only else whole
     if steps is not None:
         with user_input():
             population = replace(population, members=tuple(replace(m, steps=steps) for m in population.members))
@@ -99,7 +98,8 @@ def train_many(
             stands = train_population(population, folder, count, shown)
     except KeyboardInterrupt:
         raise UserError(f"interrupted: the same command continues the runs in {folder}") from None
-    page = write_report(population, stands, folder)
+    # The page shows the members that were not asked for, too, as far as they have come.
+    page = write_report(population, {m.name: stands.get(m.name) or stand_of(m, folder) for m in whole.members}, folder)
     failed = [stand for stand in stands.values() if stand.status == FAILED]
     for stand in failed:
         console.print(f"{stand.name} failed: {stand.error} (more in {stand.folder / 'error.txt'})", style="red")

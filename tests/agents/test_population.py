@@ -24,11 +24,13 @@ from tab_marl.agents.population_run import (
     ERROR_FILE,
     FAILED,
     TRAINING,
+    WAITING,
     MemberStand,
     _work,
     expected_seconds,
     finished,
     seconds_left,
+    stand_of,
     train_population,
 )
 from tab_marl.agents.training import train
@@ -215,6 +217,9 @@ def test_finished_runs_are_known_by_their_settings(two):
     assert not finished(replace(steady, seed=9), runs / "steady")
     assert not finished(replace(steady, split="final"), runs / "steady"), "its card must be written anew"
     assert not finished(steady, runs / "nowhere")
+    stand = stand_of(steady, runs)
+    assert stand.status == DONE and stand.steps == 800 and stand.cpu_seconds > 0
+    assert stand_of(replace(steady, name="nobody"), runs).status == WAITING
 
 
 def test_the_page_holds_a_learning_curve_per_policy_and_needs_nothing_else(two, tmp_path):
