@@ -43,7 +43,7 @@ def draw_paths(study: Study, y: Yardstick, target: Path, seed: int = 5) -> None:
     panels = [(p.name, _ways(p, y, seed)) for p in players]
     panels.append(("TAB-Field", _sampled(y, seed)))
     rows = -(-len(panels) // COLUMNS)
-    figure, axes = plt.subplots(rows, COLUMNS, figsize=(1.75 * COLUMNS, 1.98 * rows + 0.75), dpi=110, squeeze=False)
+    figure, axes = plt.subplots(rows, COLUMNS, figsize=(1.75 * COLUMNS, 1.84 * rows + 0.75), dpi=110, squeeze=False)
     for axis in axes.flat:
         axis.set_axis_off()
     for axis, (name, ways) in zip(axes.flat, panels, strict=False):
@@ -56,7 +56,7 @@ def draw_paths(study: Study, y: Yardstick, target: Path, seed: int = 5) -> None:
         )
     figure.suptitle(to_english(y.task.mission, y.task.scenario), fontsize=9, y=0.995)
     figure.subplots_adjust(
-        left=0.01, right=0.925, bottom=0.01, top=1 - 0.5 / (1.98 * rows + 0.75), wspace=0.06, hspace=0.16
+        left=0.01, right=0.925, bottom=0.01, top=1 - 0.5 / (1.84 * rows + 0.75), wspace=0.06, hspace=0.16
     )
     bar = figure.colorbar(
         ScalarMappable(norm=Normalize(0, 1), cmap=TIMES), cax=figure.add_axes((0.94, 0.2, 0.012, 0.6))

@@ -85,11 +85,11 @@ def test_one_command_is_enough(good_zip, tmp_path, monkeypatch) -> None:
 
 def test_a_model_that_falls_short_is_refused_or_marked(bad_zip, tmp_path) -> None:
     with pytest.raises(
-        BelowClaim, match=r"M1: \d of 2 completed in .*below 90 %.*--missions.*--normalisation.*--anyway"
+        BelowClaim, match=r"M1: \d of 1 completed in .*below 90 %.*--missions.*--normalisation.*--anyway"
     ):
-        join(bad_zip, Joining("theirs"), tmp_path / "zoo", episodes=2)
+        join(bad_zip, Joining("theirs"), tmp_path / "zoo", episodes=1)
     assert not (tmp_path / "zoo").exists(), "nothing of it is written"
-    policy, folder = join(bad_zip, Joining("theirs", missions=("M1",)), tmp_path / "zoo", anyway=True, episodes=2)
+    policy, folder = join(bad_zip, Joining("theirs", missions=("M1",)), tmp_path / "zoo", anyway=True, episodes=1)
     kept = load_policy(folder).card
     assert kept.exceptions and kept.exceptions == policy.card.exceptions and kept.missions[0] == "M1"
     assert all(said.startswith("M1:") for said in kept.exceptions), "only what it claims is held against it"
@@ -128,7 +128,7 @@ def test_claims_need_nine_tenths_in_both_worlds_and_gaps_are_told() -> None:
 def test_sampled_tasks_go_through_all_compositions() -> None:
     tasks = sampled_tasks(len(COMPOSITIONS), 3)
     assert [task.mission.name for task in tasks] == list(COMPOSITIONS)
-    assert tasks == sampled_tasks(len(COMPOSITIONS), 3) != sampled_tasks(len(COMPOSITIONS), 4)
+    assert tasks[:2] == sampled_tasks(2, 3) != sampled_tasks(2, 4)
 
 
 def test_a_release_measures_and_writes_cards(tmp_path, monkeypatch) -> None:
@@ -136,7 +136,7 @@ def test_a_release_measures_and_writes_cards(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("tab_marl.agents.release.MOVES_TASKS", 2)
     direct = find_policy("direct")
     late = next(policy for policy in load_zoo(split="development") if policy.style.name == "late")
-    sheet = Sheet.draw(10, 8, 10)
+    sheet = Sheet.draw(5, 2, 5)
     lines = list(release([late], [direct, direct], tmp_path, sheet))
     assert lines[0].startswith(late.name) and lines[1].startswith("MLE-POMCP: ")
     card = load_policy(tmp_path / late.name).card
