@@ -139,9 +139,10 @@ def _work(settings: TrainingSettings, folder: Path, command: str, send: Connecti
             )
 
     try:
-        export_policy(train(settings, folder, tell), settings, folder, command)
+        model = train(settings, folder, tell)
+        export_policy(model, settings, folder, command)
         (folder / ERROR_FILE).unlink(missing_ok=True)
-        send.send({"status": DONE, "cpu_seconds": _logged_seconds(folder)})
+        send.send({"status": DONE, "steps": int(model.num_timesteps), "cpu_seconds": _logged_seconds(folder)})
     except KeyboardInterrupt:
         pass  # the parent was told, too
     except BrokenPipeError:
