@@ -20,7 +20,9 @@ def store(tmp_path, synthetic):
         store.use("abc", {"seed": 1}, {})
         rows = [
             synthetic.row(seed=1, slack=1.234567890123),
-            synthetic.row("S-POMCP", 0, intercepted=False, completed=True, slack=float("nan"), error='odd, "quoted"\ntext'),
+            synthetic.row(
+                "S-POMCP", 0, intercepted=False, completed=True, slack=float("nan"), error='odd, "quoted"\ntext'
+            ),
         ]
         store.add("abc", [(r, synthetic.timing()) for r in rows])
         yield store

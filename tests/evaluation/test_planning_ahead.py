@@ -83,7 +83,9 @@ def test_every_planner_and_mission_has_a_reference():
 
 
 def test_forecast_in_words(synthetic):
-    rows = [synthetic.row(p, s, steps=300 + 10 * s * (p == "S-POMCP")) for s in range(20) for p in ("S-POMCP", "TAB-POMCP")]
+    rows = [
+        synthetic.row(p, s, steps=300 + 10 * s * (p == "S-POMCP")) for s in range(20) for p in ("S-POMCP", "TAB-POMCP")
+    ]
     lines = ahead.forecast(150, 0.05, rows, ahead.Cost(900, 1800.0, "from 9 stored episodes"), 2)
     assert lines[0].startswith("to play: 900 episodes, about 15 min with 2 workers (2.00 s of processor time each")
     assert "50 % to +- 7.9" in lines[1] and "381 at 50 %" in lines[1]
