@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.agents.actor import Actor, ActorError, Memory
-from tab_marl.agents.cards import is_name
 from tab_marl.agents.planners import PLANNERS, make_planner
-from tab_marl.agents.sb3_actors import read_zip
-from tab_marl.agents.zoo import CARD_FILE, SHIPPED, PolicyError, all_policies, find_policy, user_zoo
+from tab_marl.agents.policies.actor import Actor, ActorError, Memory
+from tab_marl.agents.policies.cards import is_name
+from tab_marl.agents.policies.sb3_actors import read_zip
+from tab_marl.agents.policies.zoo import CARD_FILE, SHIPPED, PolicyError, all_policies, find_policy, user_zoo
 from tab_marl.envs.opponents import OPPONENTS, Player
 from tab_marl.mission.tasks import Task
 from tab_marl.world.scenario import UnknownName

@@ -302,8 +302,8 @@ def goal_places(task: Task) -> tuple[tuple[float, float], ...]:
 
 def zoo_rollouts(task: Task, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """Trajectories of the shipped policies in this task, unopposed."""
-    from tab_marl.agents import rollouts
-    from tab_marl.agents.zoo import load_zoo
+    from tab_marl.agents.measures import rollouts
+    from tab_marl.agents.policies.zoo import load_zoo
 
     return rollouts.zoo_rollouts(load_zoo(), task, rng, ROLLOUTS_PER_POLICY)
 

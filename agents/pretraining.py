@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tab_marl.agents.adversaries import AdversaryPolicy
-from tab_marl.agents.rollouts import rollout_unopposed
-from tab_marl.agents.zoo import SHIPPED, PolicyError, ZooPolicy
+from tab_marl.agents.measures.rollouts import rollout_unopposed
+from tab_marl.agents.policies.zoo import SHIPPED, PolicyError, ZooPolicy
 from tab_marl.mission.tasks import Task
 from tab_marl.planning.models.interface import Sighting, TickObservation
 from tab_marl.planning.models.mission_map import MissionMap

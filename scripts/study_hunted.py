@@ -21,8 +21,8 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from tab_marl.agents.hunted_study import HuntedRow, Unhunted, entropy_bits, habits_of, study, unhunted, values
-from tab_marl.agents.zoo import find_policy, load_policy
+from tab_marl.agents.hunted.study import HuntedRow, Unhunted, entropy_bits, habits_of, study, unhunted, values
+from tab_marl.agents.policies.zoo import find_policy, load_policy
 from tab_marl.envs.styles import STYLES, Style
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -9,9 +9,9 @@ from typing import Annotated
 import typer
 from rich.progress import Progress
 
-from tab_marl.agents.diversity import Yardstick
-from tab_marl.agents.release import release_moves
-from tab_marl.agents.zoo import SHIPPED, load_zoo
+from tab_marl.agents.measures.diversity import Yardstick
+from tab_marl.agents.measures.release import release_moves
+from tab_marl.agents.policies.zoo import SHIPPED, load_zoo
 from tab_marl.evaluation import population_figures as figures
 from tab_marl.evaluation import population_study as tables
 

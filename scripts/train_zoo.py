@@ -14,10 +14,10 @@ from typing import Annotated
 import typer
 from rich.progress import Progress
 
-from tab_marl.agents.measuring import Sheet
-from tab_marl.agents.population import Population
-from tab_marl.agents.release import release
-from tab_marl.agents.zoo import CONTROLS, POLICY_FOLDER, SHIPPED, load_policy, save_policy
+from tab_marl.agents.measures.measuring import Sheet
+from tab_marl.agents.measures.release import release
+from tab_marl.agents.policies.zoo import CONTROLS, POLICY_FOLDER, SHIPPED, load_policy, save_policy
+from tab_marl.agents.population.members import Population
 
 
 def main(

@@ -28,7 +28,7 @@ _HOME = {
     "Pomcp": "tab_marl.planning",
     "PomcpOptions": "tab_marl.planning",
     "make_planner": "tab_marl.agents.planners",
-    "load_zoo": "tab_marl.agents.zoo",
+    "load_zoo": "tab_marl.agents.policies.zoo",
 }
 _MODULES = ("agents", "envs", "evaluation", "field", "mission", "planning", "world")
 
@@ -63,7 +63,7 @@ __all__ = [
 if TYPE_CHECKING:
     from tab_marl import agents, envs, evaluation, field, mission, planning, world
     from tab_marl.agents.planners import make_planner
-    from tab_marl.agents.zoo import load_zoo
+    from tab_marl.agents.policies.zoo import load_zoo
     from tab_marl.field import FieldOptions, FieldProblem, TabField, solve
     from tab_marl.mission import Constraint, Mission, parse_mission, to_english
     from tab_marl.mission.tasks import Task, sample_task

@@ -19,7 +19,7 @@ from tab_marl.evaluation.errors import UserError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from tab_marl.agents.cards import Split
+    from tab_marl.agents.policies.cards import Split
     from tab_marl.evaluation.store import Store, StoredSettings
 
 app = typer.Typer(
@@ -315,7 +315,7 @@ def zoo_add(
 
     Refused if it completes less than 90 % of a mission type that it claims.
     """
-    from tab_marl.agents.joining import Joining
+    from tab_marl.agents.policies.joining import Joining
     from tab_marl.evaluation.zoo_view import add_to_zoo
 
     _announce_first_use()
@@ -339,7 +339,7 @@ def zoo_verify(
 
 
 def _split(name: str) -> Split:
-    from tab_marl.agents.cards import SPLITS
+    from tab_marl.agents.policies.cards import SPLITS
     from tab_marl.evaluation.errors import require_known
 
     (right,) = require_known("split", (name,), SPLITS)

@@ -8,10 +8,10 @@ from functools import lru_cache
 from pathlib import Path
 
 from tab_marl.agents.adversaries import AdversaryPolicy, ScriptedAdversary
-from tab_marl.agents.cards import SPLITS, Split
+from tab_marl.agents.measures.rollouts import zoo_rollouts
 from tab_marl.agents.planners import ROLLOUTS_PER_POLICY, Rollouts
-from tab_marl.agents.rollouts import zoo_rollouts
-from tab_marl.agents.zoo import SHIPPED, ZooPolicy, all_policies, find_policy, load_policy, load_zoo
+from tab_marl.agents.policies.cards import SPLITS, Split
+from tab_marl.agents.policies.zoo import SHIPPED, ZooPolicy, all_policies, find_policy, load_policy, load_zoo
 from tab_marl.evaluation.errors import UserError, require_known
 
 SCRIPTED = "scripted"

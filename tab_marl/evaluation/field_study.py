@@ -17,10 +17,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from tab_marl.agents.measures.rollouts import rollout_unopposed
 from tab_marl.agents.planners import PlannerOptions
+from tab_marl.agents.policies.zoo import find_policy
 from tab_marl.agents.pretraining import untrained
-from tab_marl.agents.rollouts import rollout_unopposed
-from tab_marl.agents.zoo import find_policy
 from tab_marl.evaluation.prediction import Forecast, kernel_forecast, mixed
 from tab_marl.evaluation.units import stable_hash
 from tab_marl.field import FieldOptions, InfeasibleField, ProductBelief, sample_paths

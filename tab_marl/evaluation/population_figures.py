@@ -16,9 +16,9 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 from numpy.typing import NDArray
 
 from tab_marl.agents.adversaries import AdversaryPolicy, ScriptedAdversary
-from tab_marl.agents.diversity import Behaviour, Yardstick
-from tab_marl.agents.measuring import TIME_USED
-from tab_marl.agents.rollouts import run_bank
+from tab_marl.agents.measures.diversity import Behaviour, Yardstick
+from tab_marl.agents.measures.measuring import TIME_USED
+from tab_marl.agents.measures.rollouts import run_bank
 from tab_marl.envs.adversary_observation import AdversaryTask
 from tab_marl.envs.batched import Bank
 from tab_marl.evaluation.population_study import Study, side_interval

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from tab_marl.agents.adversaries import ScriptedAdversary
-from tab_marl.agents.cards import CLAIM, PolicyCard
-from tab_marl.agents.diversity import SPREAD, Behaviour, field_samples, occupancy_distance
-from tab_marl.agents.measuring import MEASURED, TIME_USED, Sheet, gap, worlds_gap
-from tab_marl.agents.validation import wilson
-from tab_marl.agents.zoo import ZooPolicy
+from tab_marl.agents.measures.diversity import SPREAD, Behaviour, field_samples, occupancy_distance
+from tab_marl.agents.measures.measuring import MEASURED, TIME_USED, Sheet, gap, worlds_gap
+from tab_marl.agents.measures.validation import wilson
+from tab_marl.agents.policies.cards import CLAIM, PolicyCard
+from tab_marl.agents.policies.zoo import ZooPolicy
 
 FIELD_SEED = 1
 RESAMPLES = 2000

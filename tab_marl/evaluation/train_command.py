@@ -16,8 +16,8 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from tab_marl.evaluation.errors import UserError, user_input
 
 if TYPE_CHECKING:
-    from tab_marl.agents.population_run import MemberStand
-    from tab_marl.agents.training import Progress as Stand
+    from tab_marl.agents.population.run import MemberStand
+    from tab_marl.agents.training.train import Progress as Stand
 
 TENTHS = 10
 
@@ -31,9 +31,9 @@ def train_one(
     console: Console,
 ) -> None:
     """Train, or continue, a policy with a progress bar; exports it when done."""
-    from tab_marl.agents.training import train
-    from tab_marl.agents.training_settings import TrainingSettings
-    from tab_marl.agents.zoo import export_policy
+    from tab_marl.agents.policies.zoo import export_policy
+    from tab_marl.agents.training.settings import TrainingSettings
+    from tab_marl.agents.training.train import train
 
     if config is not None and (style is not None or algorithm is not None):
         raise UserError("give --config, or --style and --algorithm, not both: the file holds them")
@@ -78,9 +78,9 @@ def train_many(
     file: Path, only: Sequence[str] | None, workers: int | None, steps: int | None, out: Path | None, console: Console
 ) -> bool:
     """Train, or continue, the population of a file and write its page; returns whether every member succeeded."""
-    from tab_marl.agents.population import Population
-    from tab_marl.agents.population_report import write_report
-    from tab_marl.agents.population_run import DONE, FAILED, stand_of, train_population
+    from tab_marl.agents.population.members import Population
+    from tab_marl.agents.population.report import write_report
+    from tab_marl.agents.population.run import DONE, FAILED, stand_of, train_population
 
     _check_steps(steps)
     whole = Population.load(file)
@@ -144,7 +144,7 @@ class _Lines:
     def __exit__(self, *ending: object) -> None: ...
 
     def __call__(self, stand: MemberStand, stands: dict[str, MemberStand]) -> None:
-        from tab_marl.agents.population_run import FAILED, HABITS, TRAINING, seconds_left, share_done
+        from tab_marl.agents.population.run import FAILED, HABITS, TRAINING, seconds_left, share_done
 
         ended = sum(s.ended for s in stands.values())
         tenth = int(TENTHS * share_done(stand))
@@ -180,7 +180,7 @@ class _Bars:
         self._progress.stop()
 
     def __call__(self, stand: MemberStand, stands: dict[str, MemberStand]) -> None:
-        from tab_marl.agents.population_run import DONE, FAILED, expected_seconds, seconds_left, share_done
+        from tab_marl.agents.population.run import DONE, FAILED, expected_seconds, seconds_left, share_done
 
         if stand.ended:
             bar = self._bars.pop(stand.name, None)

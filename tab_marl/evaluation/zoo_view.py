@@ -15,11 +15,11 @@ from rich.table import Table
 from rich.text import Text
 
 from tab_marl.agents.adversaries import AdversaryPolicy
-from tab_marl.agents.cards import CLAIM, MissionRecord, PolicyCard, Split, StyleTest
-from tab_marl.agents.joining import Joining, join
-from tab_marl.agents.measuring import MEASURED, OnPlayed, gap, sampled_tasks, success, worlds_gap
-from tab_marl.agents.validation import PHYSICS, HeldOut
-from tab_marl.agents.zoo import SHIPPED, all_policies, find_policy, load_policy, user_zoo
+from tab_marl.agents.measures.measuring import MEASURED, OnPlayed, gap, sampled_tasks, success, worlds_gap
+from tab_marl.agents.measures.validation import PHYSICS, HeldOut
+from tab_marl.agents.policies.cards import CLAIM, MissionRecord, PolicyCard, Split, StyleTest
+from tab_marl.agents.policies.joining import Joining, join
+from tab_marl.agents.policies.zoo import SHIPPED, all_policies, find_policy, load_policy, user_zoo
 from tab_marl.envs.styles import Style
 from tab_marl.mission.compositions import SAMPLED
 from tab_marl.mission.tasks import MISSION_IDS

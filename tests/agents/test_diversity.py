@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.distance import jensenshannon
 
 from tab_marl.agents.adversaries import ScriptedAdversary
-from tab_marl.agents.diversity import (
+from tab_marl.agents.measures.diversity import (
     FIGURES,
     SPREAD,
     Behaviour,
@@ -22,10 +22,10 @@ from tab_marl.agents.diversity import (
     own_figure,
     style_test,
 )
-from tab_marl.agents.homotopy import Sides, winding_number
-from tab_marl.agents.rollouts import run_bank
-from tab_marl.agents.training_env import build_bank
-from tab_marl.agents.validation import HeldOut
+from tab_marl.agents.measures.homotopy import Sides, winding_number
+from tab_marl.agents.measures.rollouts import run_bank
+from tab_marl.agents.measures.validation import HeldOut
+from tab_marl.agents.training.env import build_bank
 from tab_marl.envs.styles import STYLES
 from tab_marl.mission import parse_mission
 from tab_marl.mission.tasks import Task

@@ -12,10 +12,10 @@ from scipy.optimize import linprog
 from scipy.stats import chisquare
 
 from tab_marl.agents.adversaries import ScriptedAdversary
-from tab_marl.agents.habits import HabitSettings, MixtureLearner, learn_habits, learned_style, with_weights
-from tab_marl.agents.hunted_study import HuntedRow, entropy_bits, habits_of, study, unhunted, values
-from tab_marl.agents.training_env import HELD_OUT, draw_tasks
-from tab_marl.agents.zoo import load_zoo
+from tab_marl.agents.hunted.habits import HabitSettings, MixtureLearner, learn_habits, learned_style, with_weights
+from tab_marl.agents.hunted.study import HuntedRow, entropy_bits, habits_of, study, unhunted, values
+from tab_marl.agents.policies.zoo import load_zoo
+from tab_marl.agents.training.env import HELD_OUT, draw_tasks
 from tab_marl.envs.adversary_observation import AdversaryTask
 from tab_marl.envs.styles import STYLES, Habit, Style, mixture_of
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from tab_marl.agents.adversaries import ScriptedAdversary
-from tab_marl.agents.hunted_egos import hunter_names, hunting_options
-from tab_marl.agents.hunted_env import REWARDS, HuntedVecEnv, hunted_env, hunted_tasks
-from tab_marl.agents.hunted_play import play_hunted
+from tab_marl.agents.hunted.egos import hunter_names, hunting_options
+from tab_marl.agents.hunted.env import REWARDS, HuntedVecEnv, hunted_env, hunted_tasks
+from tab_marl.agents.hunted.play import play_hunted
 from tab_marl.agents.planner_memory import PlannerMemory
 from tab_marl.agents.planners import PlannerOptions, make_planner
-from tab_marl.agents.training_env import HELD_OUT, draw_tasks
-from tab_marl.agents.training_settings import TrainingSettings
+from tab_marl.agents.training.env import HELD_OUT, draw_tasks
+from tab_marl.agents.training.settings import TrainingSettings
 from tab_marl.envs.adversary_observation import AdversaryTask
 from tab_marl.envs.batched import Bank, BatchedWorld, Prices
 from tab_marl.envs.batched_arenas import BatchedArenas

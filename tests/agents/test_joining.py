@@ -10,11 +10,11 @@ import torch
 from stable_baselines3 import PPO
 from typer.testing import CliRunner
 
-from tab_marl.agents.cards import CLAIM, MissionRecord
-from tab_marl.agents.joining import BelowClaim, Joining, join
-from tab_marl.agents.measuring import Sheet, claimed, gap, measured_policy, sampled_tasks, worlds_gap
-from tab_marl.agents.release import release, summary
-from tab_marl.agents.zoo import ZOO_VARIABLE, PolicyError, all_policies, find_policy, load_policy, load_zoo
+from tab_marl.agents.measures.measuring import Sheet, claimed, gap, measured_policy, sampled_tasks, worlds_gap
+from tab_marl.agents.measures.release import release, summary
+from tab_marl.agents.policies.cards import CLAIM, MissionRecord
+from tab_marl.agents.policies.joining import BelowClaim, Joining, join
+from tab_marl.agents.policies.zoo import ZOO_VARIABLE, PolicyError, all_policies, find_policy, load_policy, load_zoo
 from tab_marl.cli import app
 from tab_marl.envs.single_agent import adversary_env
 from tab_marl.mission.compositions import COMPOSITIONS, SAMPLED
@@ -133,7 +133,7 @@ def test_sampled_tasks_go_through_all_compositions() -> None:
 
 def test_a_release_measures_and_writes_cards(tmp_path, monkeypatch) -> None:
     """With the shipped direct policy twice for its controls, which nothing can move against."""
-    monkeypatch.setattr("tab_marl.agents.release.MOVES_TASKS", 2)
+    monkeypatch.setattr("tab_marl.agents.measures.release.MOVES_TASKS", 2)
     direct = find_policy("direct")
     late = next(policy for policy in load_zoo(split="development") if policy.style.name == "late")
     sheet = Sheet.draw(5, 2, 5)

@@ -12,7 +12,7 @@ import torch
 from stable_baselines3 import A2C, PPO, SAC
 
 from tab_marl.agents.opponents import load_model, load_opponent
-from tab_marl.agents.zoo import PolicyError, ZooPolicy, load_zoo
+from tab_marl.agents.policies.zoo import PolicyError, ZooPolicy, load_zoo
 from tab_marl.envs.opponents import Model
 from tab_marl.envs.single_agent import adversary_env, ego_env
 from tab_marl.world.scenario import UnknownName

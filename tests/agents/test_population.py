@@ -17,9 +17,10 @@ import pytest
 from rich.console import Console
 from safetensors.numpy import load_file
 
-from tab_marl.agents.population import FOLDER, Population
-from tab_marl.agents.population_report import PAGE_FILE, PICTURE_FILE, Line, curve_svg, write_report
-from tab_marl.agents.population_run import (
+from tab_marl.agents.policies.zoo import WEIGHTS_FILE, export_policy
+from tab_marl.agents.population.members import FOLDER, Population
+from tab_marl.agents.population.report import PAGE_FILE, PICTURE_FILE, Line, curve_svg, write_report
+from tab_marl.agents.population.run import (
     DONE,
     ERROR_FILE,
     FAILED,
@@ -33,11 +34,10 @@ from tab_marl.agents.population_run import (
     stand_of,
     train_population,
 )
-from tab_marl.agents.training import train
-from tab_marl.agents.training_algorithms import ALGORITHMS
-from tab_marl.agents.training_log import LearningCurve, read_log
-from tab_marl.agents.training_settings import TrainingError, TrainingSettings
-from tab_marl.agents.zoo import WEIGHTS_FILE, export_policy
+from tab_marl.agents.training.algorithms import ALGORITHMS
+from tab_marl.agents.training.log import LearningCurve, read_log
+from tab_marl.agents.training.settings import TrainingError, TrainingSettings
+from tab_marl.agents.training.train import train
 from tab_marl.envs.styles import STYLES
 from tab_marl.evaluation.train_command import clock, train_many
 
@@ -279,7 +279,7 @@ def test_the_command_says_how_many_failed_and_returns_it(tmp_path, monkeypatch, 
         on_stand(stands["bad"], stands)
         return stands
 
-    monkeypatch.setattr("tab_marl.agents.population_run.train_population", play)
+    monkeypatch.setattr("tab_marl.agents.population.run.train_population", play)
     for number, terminal in enumerate((False, True)):
         console = Console(force_terminal=terminal, width=160, highlight=False)
         assert not train_many(path, None, 2, None, tmp_path / f"out{number}", console)

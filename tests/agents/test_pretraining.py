@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from tab_marl.agents.adversaries import ScriptedAdversary
+from tab_marl.agents.measures.rollouts import rollout_unopposed
+from tab_marl.agents.policies.zoo import PolicyError, load_zoo
 from tab_marl.agents.pretraining import MOVES_FILE, count_moves, pretrained, read_moves, untrained, write_moves
-from tab_marl.agents.rollouts import rollout_unopposed
-from tab_marl.agents.zoo import PolicyError, load_zoo
 from tab_marl.mission.tasks import sample_task
 
 

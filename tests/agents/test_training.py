@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import torch
 
-from tab_marl.agents.training import CHECKPOINT_FILE, LOG_FOLDER, train
-from tab_marl.agents.training_env import HELD_OUT, TRAINING, BatchedVecEnv, build_bank, draw_tasks
-from tab_marl.agents.training_settings import TrainingError, TrainingSettings
+from tab_marl.agents.training.env import HELD_OUT, TRAINING, BatchedVecEnv, build_bank, draw_tasks
+from tab_marl.agents.training.settings import TrainingError, TrainingSettings
+from tab_marl.agents.training.train import CHECKPOINT_FILE, LOG_FOLDER, train
 from tab_marl.envs.styles import STYLES, Style
 from tab_marl.world.scenario import UnknownName
 
@@ -101,8 +101,8 @@ def test_a_killed_process_continues_to_the_same_weights(undisturbed, tmp_path):
     run = tmp_path / "run"
     program = (
         "import sys, time\n"
-        "from tab_marl.agents.training import train\n"
-        "from tab_marl.agents.training_settings import TrainingSettings\n"
+        "from tab_marl.agents.training.train import train\n"
+        "from tab_marl.agents.training.settings import TrainingSettings\n"
         "pause = lambda stand: time.sleep(0.2 if stand.phase == 'training' else 0)\n"
         "train(TrainingSettings.from_toml(sys.argv[1]), sys.argv[2], pause)\n"
     )

@@ -12,12 +12,12 @@ import pytest
 import torch
 import yaml
 
-from tab_marl.agents.actor import Memory
-from tab_marl.agents.training import LOG_FILE, Sampler, build_model, train, training_tasks
-from tab_marl.agents.training_algorithms import ALGORITHMS
-from tab_marl.agents.training_checkpoint import CHECKPOINT_FILE, REPLAY_FOLDER
-from tab_marl.agents.training_env import TRAINING, BatchedVecEnv, build_bank, difficulties
-from tab_marl.agents.training_hyperparameters import (
+from tab_marl.agents.policies.actor import Memory
+from tab_marl.agents.policies.zoo import export_policy, load_policy
+from tab_marl.agents.training.algorithms import ALGORITHMS
+from tab_marl.agents.training.checkpoint import CHECKPOINT_FILE, REPLAY_FOLDER
+from tab_marl.agents.training.env import TRAINING, BatchedVecEnv, build_bank, difficulties
+from tab_marl.agents.training.hyperparameters import (
     BATCHED_MISSIONS,
     FILES,
     HUNTED_MISSIONS,
@@ -28,10 +28,10 @@ from tab_marl.agents.training_hyperparameters import (
     schedule,
     write_policy_kwargs,
 )
-from tab_marl.agents.training_initial import begin_with
-from tab_marl.agents.training_log import LearningLog, read_log
-from tab_marl.agents.training_settings import TrainingError, TrainingSettings
-from tab_marl.agents.zoo import export_policy, load_policy
+from tab_marl.agents.training.initial import begin_with
+from tab_marl.agents.training.log import LearningLog, read_log
+from tab_marl.agents.training.settings import TrainingError, TrainingSettings
+from tab_marl.agents.training.train import LOG_FILE, Sampler, build_model, train, training_tasks
 from tab_marl.envs.styles import Style
 
 ROBOTS = 8

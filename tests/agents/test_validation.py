@@ -7,9 +7,8 @@ import pytest
 from scipy.stats import binomtest
 
 from tab_marl.agents.adversaries import ScriptedAdversary
-from tab_marl.agents.rollouts import rollout_unopposed, zoo_rollouts
-from tab_marl.agents.training_env import build_bank
-from tab_marl.agents.validation import (
+from tab_marl.agents.measures.rollouts import rollout_unopposed, zoo_rollouts
+from tab_marl.agents.measures.validation import (
     HeldOut,
     allowed_seconds,
     mission_records,
@@ -17,7 +16,8 @@ from tab_marl.agents.validation import (
     run_held_out,
     wilson,
 )
-from tab_marl.agents.zoo import load_zoo
+from tab_marl.agents.policies.zoo import load_zoo
+from tab_marl.agents.training.env import build_bank
 from tab_marl.envs.styles import STYLES
 from tab_marl.mission.monitor import Monitor
 from tab_marl.mission.tasks import sample_task

@@ -14,8 +14,7 @@ import torch
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
-from tab_marl.agents.training_settings import TrainingSettings
-from tab_marl.agents.zoo import (
+from tab_marl.agents.policies.zoo import (
     CARD_FILE,
     SHIPPED,
     WEIGHTS_FILE,
@@ -26,6 +25,7 @@ from tab_marl.agents.zoo import (
     load_zoo,
     save_policy,
 )
+from tab_marl.agents.training.settings import TrainingSettings
 from tab_marl.envs.adversary_kernels import O_LIMIT
 from tab_marl.envs.adversary_observation import LAYOUT_VERSION, OBSERVED, observation_bounds
 from tab_marl.world.scenario import UnknownName
@@ -125,7 +125,7 @@ def model():
     """An untrained PPO model of the shape that policies have."""
     from stable_baselines3 import PPO
 
-    from tab_marl.agents.training_env import TRAINING, BatchedVecEnv, build_bank, draw_tasks
+    from tab_marl.agents.training.env import TRAINING, BatchedVecEnv, build_bank, draw_tasks
     from tab_marl.envs.styles import Style
 
     bank = build_bank(draw_tasks(TRAINING, 0, 1, ("M1",), ("point",)), Style(), 0)

@@ -15,11 +15,11 @@ from sb3_contrib import TQC, RecurrentPPO
 from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 
 import tab_marl  # noqa: F401, registers the environments
-from tab_marl.agents.actor import Actor, ActorError, Memory, Network
 from tab_marl.agents.opponents import load_model
-from tab_marl.agents.sb3_actors import actor_of_model, normalised, read_zip
-from tab_marl.agents.training_settings import TrainingSettings
-from tab_marl.agents.zoo import PolicyError, load_policy, policy_of, save_policy
+from tab_marl.agents.policies.actor import Actor, ActorError, Memory, Network
+from tab_marl.agents.policies.sb3_actors import actor_of_model, normalised, read_zip
+from tab_marl.agents.policies.zoo import PolicyError, load_policy, policy_of, save_policy
+from tab_marl.agents.training.settings import TrainingSettings
 from tab_marl.envs.adversary_kernels import O_LIMIT
 from tab_marl.envs.adversary_observation import OBSERVED, observation_bounds
 from tab_marl.envs.batched_env import batched_adversary_env, batched_ego_env

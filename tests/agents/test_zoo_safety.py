@@ -18,9 +18,17 @@ from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 from stable_baselines3 import PPO
 
-from tab_marl.agents import sb3_actors, zoo
-from tab_marl.agents.joining import Joining, join, read_model
-from tab_marl.agents.zoo import CARD_FILE, SHIPPED, WEIGHTS_FILE, PolicyError, find_policy, load_policy, load_zoo
+from tab_marl.agents.policies import sb3_actors, zoo
+from tab_marl.agents.policies.joining import Joining, join, read_model
+from tab_marl.agents.policies.zoo import (
+    CARD_FILE,
+    SHIPPED,
+    WEIGHTS_FILE,
+    PolicyError,
+    find_policy,
+    load_policy,
+    load_zoo,
+)
 from tab_marl.envs.single_agent import adversary_env
 from tab_marl.world.scenario import UnknownName
 

@@ -68,7 +68,7 @@ def test_the_reference_shows_what_it_should(site: Path) -> None:
     envs, agents = ((site / "api" / f"{name}.html").read_text() for name in ("envs", "agents"))
     for name in ("tab_marl.envs.intercept.InterceptEnv", "tab_marl.envs.batched_arenas.BatchedArenas"):
         assert f'id="{name}"' in envs
-    assert 'id="tab_marl.agents.zoo.find_policy"' in agents
+    assert 'id="tab_marl.agents.policies.zoo.find_policy"' in agents
     assert "Advance by one control step" in envs
     assert "tab_marl.envs.motion_kernels.drive" not in envs, "compiled loops are not for users"
 

@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 import tab_marl  # noqa: F401, registers the environments
-from tab_marl.agents.zoo import load_zoo
+from tab_marl.agents.policies.zoo import load_zoo
 from tab_marl.envs.batched_env import BatchedEnv
 
 BATCHED = ("tab_marl/BatchedEgo-v0", "tab_marl/BatchedAdversary-v0")

@@ -7,7 +7,7 @@ import shutil
 import numpy as np
 import pytest
 
-from tab_marl.agents.zoo import SHIPPED, ZOO_VARIABLE, find_policy, load_zoo
+from tab_marl.agents.policies.zoo import SHIPPED, ZOO_VARIABLE, find_policy, load_zoo
 from tab_marl.evaluation.adversaries import opponent, population, resolve_opponents, zoo_names
 from tab_marl.evaluation.errors import UserError
 from tab_marl.evaluation.evaluate import prepare

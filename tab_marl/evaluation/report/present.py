@@ -12,7 +12,7 @@ from typing import Any
 from rich.console import Console
 
 import tab_marl
-from tab_marl.agents.zoo import PolicyError
+from tab_marl.agents.policies.zoo import PolicyError
 from tab_marl.evaluation import console as text
 from tab_marl.evaluation import tables
 from tab_marl.evaluation.errors import UserError, require_known

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.agents.population import Population
-from tab_marl.agents.population_run import FAILED, MemberStand
-from tab_marl.agents.training_algorithms import ALGORITHMS
-from tab_marl.agents.training_log import LearningCurve, read_log
-from tab_marl.agents.training_settings import UNOPPOSED, TrainingSettings
+from tab_marl.agents.population.members import Population
+from tab_marl.agents.population.run import FAILED, MemberStand
+from tab_marl.agents.training.algorithms import ALGORITHMS
+from tab_marl.agents.training.log import LearningCurve, read_log
+from tab_marl.agents.training.settings import UNOPPOSED, TrainingSettings
 
 PAGE_FILE, PICTURE_FILE = "population.html", "learning-curves.png"
 COMPETENT = 0.9
@@ -66,7 +66,7 @@ def write_report(population: Population, stands: Mapping[str, MemberStand], out_
     lines = [Line(stand, _curve(stand.folder)) for stand in stands.values()]
     missions = sorted({mission for line in lines for mission in line.last})
     environment = Environment(
-        loader=PackageLoader("tab_marl.agents"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+        loader=PackageLoader("tab_marl.agents.population"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
         lstrip_blocks=True,
     )  # fmt: skip
     page = environment.get_template("population.html.j2").render(

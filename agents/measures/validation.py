@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tab_marl.agents.adversaries import AdversaryPolicy
-from tab_marl.agents.cards import MissionRecord, World
-from tab_marl.agents.rollouts import Rollouts, run_bank
-from tab_marl.agents.training_env import HELD_OUT, build_bank, draw_tasks
+from tab_marl.agents.measures.rollouts import Rollouts, run_bank
+from tab_marl.agents.policies.cards import MissionRecord, World
+from tab_marl.agents.training.env import HELD_OUT, build_bank, draw_tasks
 from tab_marl.envs.adversary_observation import AdversaryTask
 from tab_marl.envs.batched import Bank
 from tab_marl.envs.intercept import ADVERSARY_AGENT, EGO_AGENT, InterceptEnv

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tab_marl.agents.adversaries import AdversaryPolicy
-from tab_marl.agents.cards import StyleTest
-from tab_marl.agents.homotopy import Sides
-from tab_marl.agents.rollouts import Rollouts, run_bank
-from tab_marl.agents.validation import HeldOut, allowed_seconds
+from tab_marl.agents.measures.homotopy import Sides
+from tab_marl.agents.measures.rollouts import Rollouts, run_bank
+from tab_marl.agents.measures.validation import HeldOut, allowed_seconds
+from tab_marl.agents.policies.cards import StyleTest
 from tab_marl.envs.adversary_kernels import VIA_METRES
 from tab_marl.envs.adversary_observation import AdversaryTask
 from tab_marl.envs.styles import Style

@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from tab_marl.agents.adversaries import AdversaryPolicy
-from tab_marl.agents.hunted_egos import SEEDS, hunter_names, hunting_options
-from tab_marl.agents.hunted_play import play_hunted
-from tab_marl.agents.rollouts import rollout_unopposed
-from tab_marl.agents.training_env import TRAINING, draw_tasks
-from tab_marl.agents.training_settings import TrainingError, TrainingSettings
+from tab_marl.agents.hunted.egos import SEEDS, hunter_names, hunting_options
+from tab_marl.agents.hunted.play import play_hunted
+from tab_marl.agents.measures.rollouts import rollout_unopposed
+from tab_marl.agents.training.env import TRAINING, draw_tasks
+from tab_marl.agents.training.settings import TrainingError, TrainingSettings
 from tab_marl.envs.adversary_observation import AdversaryTask, leaves_choice
 from tab_marl.envs.styles import Habit, Style
 from tab_marl.mission.tasks import Task
@@ -205,7 +205,7 @@ def learn_for(
     waits, whatever the adversary does, and there is nothing to learn. The weights for such missions then stay even.
     Raises TrainingError.
     """
-    from tab_marl.agents.zoo import policy_of
+    from tab_marl.agents.policies.zoo import policy_of
 
     families = tuple(family for family in settings.families if family == "ambiguous") or settings.families
     tasks = draw_tasks(

@@ -25,10 +25,10 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
-from tab_marl.agents.actor import ACTIONS, Actor, ActorError, Memory
-from tab_marl.agents.cards import MissionRecord, PolicyCard, Split, is_name
-from tab_marl.agents.sb3_actors import LOG_STD, actor_of_model
-from tab_marl.agents.training_settings import TrainingSettings
+from tab_marl.agents.policies.actor import ACTIONS, Actor, ActorError, Memory
+from tab_marl.agents.policies.cards import MissionRecord, PolicyCard, Split, is_name
+from tab_marl.agents.policies.sb3_actors import LOG_STD, actor_of_model
+from tab_marl.agents.training.settings import TrainingSettings
 from tab_marl.envs.adversary_kernels import O_LIMIT
 from tab_marl.envs.adversary_observation import LAYOUT_VERSION, OBSERVED
 from tab_marl.envs.styles import STYLES, Style
@@ -42,8 +42,8 @@ __all__ = [
 
 CARD_FILE = "card.json"
 WEIGHTS_FILE = "weights.safetensors"
-SHIPPED = Path(__file__).parent / "zoo"
-CONTROLS = Path(__file__).parent / "controls"
+SHIPPED = Path(__file__).parent.parent / "zoo"
+CONTROLS = Path(__file__).parent.parent / "controls"
 """Direct policies trained with other seeds, against which a style's own figure must move; they are no adversaries."""
 ZOO_VARIABLE = "TAB_MARL_ZOO"
 """Environment variable that names the user's zoo."""
@@ -323,7 +323,7 @@ def export_policy(model: Any, settings: TrainingSettings, out_dir: Path | str, c
             if usual
             else "tab-marl train --config settings.toml"
         )
-    from tab_marl.agents.habits import learned_style
+    from tab_marl.agents.hunted.habits import learned_style
 
     policy = policy_of(model, settings, int(model.num_timesteps), command, settings.description)
     style = learned_style(settings.style, out_dir)

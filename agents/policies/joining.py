@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
-from tab_marl.agents.actor import Actor, ActorError
-from tab_marl.agents.cards import PolicyCard, Split, is_name
-from tab_marl.agents.measuring import MEASURED, OnPlayed, Sheet, below_claim, claimed, measured_policy
-from tab_marl.agents.sb3_actors import normalised, read_zip
-from tab_marl.agents.zoo import CONTROLS, SHIPPED, PolicyError, ZooPolicy, load_zoo, save_policy, user_zoo
+from tab_marl.agents.measures.measuring import MEASURED, OnPlayed, Sheet, below_claim, claimed, measured_policy
+from tab_marl.agents.policies.actor import Actor, ActorError
+from tab_marl.agents.policies.cards import PolicyCard, Split, is_name
+from tab_marl.agents.policies.sb3_actors import normalised, read_zip
+from tab_marl.agents.policies.zoo import CONTROLS, SHIPPED, PolicyError, ZooPolicy, load_zoo, save_policy, user_zoo
 from tab_marl.envs.adversary_observation import LAYOUT_VERSION, OBSERVED
 from tab_marl.envs.styles import Style
 from tab_marl.mission.compositions import SAMPLED

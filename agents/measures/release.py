@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from tab_marl.agents.measuring import Sheet, gap, measured_policy
+from tab_marl.agents.measures.measuring import Sheet, gap, measured_policy
+from tab_marl.agents.measures.validation import PHYSICS
+from tab_marl.agents.policies.zoo import ZooPolicy, load_zoo, save_policy
 from tab_marl.agents.pretraining import count_moves, write_moves
-from tab_marl.agents.training_env import TRAINING, draw_tasks
-from tab_marl.agents.validation import PHYSICS
-from tab_marl.agents.zoo import ZooPolicy, load_zoo, save_policy
+from tab_marl.agents.training.env import TRAINING, draw_tasks
 from tab_marl.mission.tasks import FAMILIES, MISSION_IDS
 
 MOVES_SEED, MOVES_TASKS = 77, 45

@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.agents.habits import aware_task
-from tab_marl.agents.hunted_play import play_hunted
+from tab_marl.agents.hunted.habits import aware_task
+from tab_marl.agents.hunted.play import play_hunted
+from tab_marl.agents.measures.rollouts import run_bank
 from tab_marl.agents.planner_memory import PlannerMemory
 from tab_marl.agents.planners import PlannerOptions
-from tab_marl.agents.rollouts import run_bank
-from tab_marl.agents.training_env import HELD_OUT, build_bank, draw_tasks
-from tab_marl.agents.zoo import ZooPolicy
+from tab_marl.agents.policies.zoo import ZooPolicy
+from tab_marl.agents.training.env import HELD_OUT, build_bank, draw_tasks
 from tab_marl.envs.styles import STYLES, Style
 from tab_marl.mission.tasks import MISSION_IDS, Task
 

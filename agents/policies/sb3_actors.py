@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from tab_marl.agents.actor import Actor, ActorError, Network
+from tab_marl.agents.policies.actor import Actor, ActorError, Network
 
 WEIGHTS_IN_ZIP, DATA_IN_ZIP = "policy.pth", "data"
 LARGEST_WEIGHTS_BYTES = 64 * 2**20

@@ -11,12 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tab_marl.agents.adversaries import AdversaryPolicy
-from tab_marl.agents.cards import CLAIM, MissionRecord, PolicyCard, World
-from tab_marl.agents.diversity import FIGURES, SPREAD, Behaviour, Yardstick, behaviour, occupancy_distance, style_test
-from tab_marl.agents.rollouts import run_bank
-from tab_marl.agents.training_env import HELD_OUT, build_bank
-from tab_marl.agents.validation import BATCHED, PHYSICS, HeldOut, mission_records, play_physics
-from tab_marl.agents.zoo import ZooPolicy
+from tab_marl.agents.measures.diversity import (
+    FIGURES,
+    SPREAD,
+    Behaviour,
+    Yardstick,
+    behaviour,
+    occupancy_distance,
+    style_test,
+)
+from tab_marl.agents.measures.rollouts import run_bank
+from tab_marl.agents.measures.validation import BATCHED, PHYSICS, HeldOut, mission_records, play_physics
+from tab_marl.agents.policies.cards import CLAIM, MissionRecord, PolicyCard, World
+from tab_marl.agents.policies.zoo import ZooPolicy
+from tab_marl.agents.training.env import HELD_OUT, build_bank
 from tab_marl.mission.compositions import COMPOSITIONS, SAMPLED, sample_composition
 from tab_marl.mission.tasks import MISSION_IDS, Task
 

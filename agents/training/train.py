@@ -21,13 +21,13 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 
-from tab_marl.agents.training_algorithms import ALGORITHMS
-from tab_marl.agents.training_checkpoint import CHECKPOINT_FILE, Checkpoint, Exploration
-from tab_marl.agents.training_env import TRAINING, BatchedVecEnv, build_bank, difficulties, draw_tasks
-from tab_marl.agents.training_hyperparameters import HyperparameterError, arguments, check
-from tab_marl.agents.training_initial import begin_with
-from tab_marl.agents.training_log import LOG_FILE, ROWS, LearningLog
-from tab_marl.agents.training_settings import UNOPPOSED, TrainingError, TrainingSettings
+from tab_marl.agents.training.algorithms import ALGORITHMS
+from tab_marl.agents.training.checkpoint import CHECKPOINT_FILE, Checkpoint, Exploration
+from tab_marl.agents.training.env import TRAINING, BatchedVecEnv, build_bank, difficulties, draw_tasks
+from tab_marl.agents.training.hyperparameters import HyperparameterError, arguments, check
+from tab_marl.agents.training.initial import begin_with
+from tab_marl.agents.training.log import LOG_FILE, ROWS, LearningLog
+from tab_marl.agents.training.settings import UNOPPOSED, TrainingError, TrainingSettings
 from tab_marl.mission.tasks import Task
 
 try:
@@ -153,7 +153,7 @@ def _train(settings: TrainingSettings, folder: Path, on_progress: OnProgress | N
 
 
 def _learn_habits(settings: TrainingSettings, model: Any, folder: Path, on_progress: OnProgress | None) -> None:
-    from tab_marl.agents.habits import learn_for
+    from tab_marl.agents.hunted.habits import learn_for
 
     def learned(done: int, total: int) -> None:
         if on_progress is not None:
@@ -170,7 +170,7 @@ def _environment(settings: TrainingSettings, on_progress: OnProgress | None) -> 
             on_progress(Progress("tasks", done, total, 0.0, {}))
 
     if settings.opponent != UNOPPOSED:
-        from tab_marl.agents.hunted_env import hunted_env
+        from tab_marl.agents.hunted.env import hunted_env
 
         return hunted_env(settings, built)
     tasks = training_tasks(settings)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.save_util import recursive_getattr
 
-from tab_marl.agents.training_settings import TrainingError
+from tab_marl.agents.training.settings import TrainingError
 
 CHECKPOINT_FILE = "checkpoint.pt"
 REPLAY_FOLDER = "replay"

@@ -13,10 +13,10 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from tab_marl.agents.hunted_egos import SEEDS, Hunters, hunter_names
+from tab_marl.agents.hunted.egos import SEEDS, Hunters, hunter_names
 from tab_marl.agents.planners import PlannerOptions
-from tab_marl.agents.training_env import TRAINING, WINDOW, draw_tasks
-from tab_marl.agents.training_settings import TrainingSettings
+from tab_marl.agents.training.env import TRAINING, WINDOW, draw_tasks
+from tab_marl.agents.training.settings import TrainingSettings
 from tab_marl.envs.adversary_observation import AdversaryTask, observation_bounds
 from tab_marl.envs.batched_arenas import EVENTS, BatchedArenas
 from tab_marl.envs.episode import draw_starts

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tab_marl.agents.adversaries import AdversaryPolicy
-from tab_marl.agents.hunted_egos import Hunters
-from tab_marl.agents.hunted_env import COMPLETED, INTERCEPTED
+from tab_marl.agents.hunted.egos import Hunters
+from tab_marl.agents.hunted.env import COMPLETED, INTERCEPTED
 from tab_marl.agents.planners import PlannerOptions
 from tab_marl.envs.adversary_observation import AdversaryTask
 from tab_marl.envs.batched_arenas import BatchedArenas

@@ -16,9 +16,9 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
-from tab_marl.agents.population import Population
-from tab_marl.agents.training_algorithms import ALGORITHMS
-from tab_marl.agents.training_settings import UNOPPOSED, TrainingError, TrainingSettings
+from tab_marl.agents.population.members import Population
+from tab_marl.agents.training.algorithms import ALGORITHMS
+from tab_marl.agents.training.settings import UNOPPOSED, TrainingError, TrainingSettings
 
 WAITING, TASKS, TRAINING, HABITS, DONE, FAILED = "waiting", "tasks", "training", "habits", "done", "failed"
 ERROR_FILE = "error.txt"
@@ -121,8 +121,8 @@ def train_population(
 
 def _work(settings: TrainingSettings, folder: Path, command: str, send: Connection) -> None:
     """One member, in a process of its own; tells the parent what to change in its stand."""
-    from tab_marl.agents.training import Progress, train
-    from tab_marl.agents.zoo import export_policy
+    from tab_marl.agents.policies.zoo import export_policy
+    from tab_marl.agents.training.train import Progress, train
 
     def tell(stand: Progress) -> None:
         if stand.phase == HABITS:
@@ -180,7 +180,7 @@ def stand_of(settings: TrainingSettings, out_dir: Path) -> MemberStand:
 
 def finished(settings: TrainingSettings, folder: Path) -> bool:
     """Whether the folder holds the exported policy of a run with exactly these settings."""
-    from tab_marl.agents.zoo import CARD_FILE, POLICY_FOLDER
+    from tab_marl.agents.policies.zoo import CARD_FILE, POLICY_FOLDER
 
     card, kept = folder / POLICY_FOLDER / CARD_FILE, folder / "settings.toml"
     try:
@@ -193,7 +193,7 @@ def finished(settings: TrainingSettings, folder: Path) -> bool:
 
 
 def _logged_seconds(folder: Path) -> float:
-    from tab_marl.agents.training_log import read_log
+    from tab_marl.agents.training.log import read_log
 
     try:
         return float(read_log(folder).cpu_seconds[-1])

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, StringConstraints
 
-from tab_marl.agents.actor import Network
+from tab_marl.agents.policies.actor import Network
 from tab_marl.envs.styles import Style
 from tab_marl.mission.tasks import MISSION_IDS
 

@@ -23,12 +23,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tab_marl.agents.training_hyperparameters import HyperparameterError, check
-from tab_marl.agents.training_settings import TrainingError, TrainingSettings, as_toml, read_toml
+from tab_marl.agents.training.hyperparameters import HyperparameterError, check
+from tab_marl.agents.training.settings import TrainingError, TrainingSettings, as_toml, read_toml
 from tab_marl.envs.styles import STYLES, Style, mixture_of
 from tab_marl.world.scenario import UnknownName
 
-FOLDER = Path(__file__).parent / "populations"
+FOLDER = Path(__file__).parent
 """The populations that ship; they are found by their names."""
 KEYS = ("name", "controls", "defaults", "member")
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from tab_marl.agents.training_checkpoint import CHECKPOINT_FILE
-from tab_marl.agents.training_settings import TrainingError
+from tab_marl.agents.training.checkpoint import CHECKPOINT_FILE
+from tab_marl.agents.training.settings import TrainingError
 
 
 def begin_with(model: Any, initial: str) -> None:
@@ -38,8 +38,8 @@ def begin_with(model: Any, initial: str) -> None:
 
 def _state_of_policy(model: Any, name: str) -> dict[str, torch.Tensor]:
     """The tensors of a zoo policy's actor under the names that they have in this model."""
-    from tab_marl.agents.sb3_actors import actor_of_model
-    from tab_marl.agents.zoo import find_policy
+    from tab_marl.agents.policies.sb3_actors import actor_of_model
+    from tab_marl.agents.policies.zoo import find_policy
 
     policy = find_policy(name)
     theirs, ours = policy.actor.network, actor_of_model(model)[0].network

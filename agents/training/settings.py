@@ -16,9 +16,9 @@ from typing import Any, ClassVar
 import tomli_w
 from pydantic import TypeAdapter, ValidationError
 
-from tab_marl.agents.cards import is_name
-from tab_marl.agents.training_algorithms import ALGORITHMS
-from tab_marl.agents.training_hyperparameters import (
+from tab_marl.agents.policies.cards import is_name
+from tab_marl.agents.training.algorithms import ALGORITHMS
+from tab_marl.agents.training.hyperparameters import (
     ACTIVATIONS,
     BATCHED_MISSIONS,
     HUNTED_MISSIONS,

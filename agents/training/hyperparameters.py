@@ -17,9 +17,9 @@ from typing import Any
 
 import yaml
 
-from tab_marl.agents.training_algorithms import ALGORITHMS
+from tab_marl.agents.training.algorithms import ALGORITHMS
 
-FILES = Path(__file__).parent / "hyperparameters"
+FILES = Path(__file__).parent.parent / "hyperparameters"
 BATCHED_MISSIONS = "tab_marl/BatchedMissions-v0"
 """Key of the batched world of unopposed adversaries, in which policies are trained."""
 HUNTED_MISSIONS = "tab_marl/HuntedMissions-v0"
