@@ -94,6 +94,7 @@ class RayEngine:
         self._look()
         waiting = {slot.pending: slot for slot in self._slots if slot.pending is not None}
         if not waiting:
+            self._check_patience()
             time.sleep(min(timeout_seconds, 0.2))
             return []
         done, rest = self._ray.wait(list(waiting), num_returns=1, timeout=timeout_seconds)
@@ -158,7 +159,9 @@ class RayEngine:
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         remote = self._ray.remote(num_cpus=1, max_restarts=0, max_task_retries=0)(Player)
-        for node in self._nodes():
+        nodes = self._nodes()
+        self._check_refused(nodes)
+        for node in nodes:
             name = node["NodeID"]
             if name in self._refused:
                 continue
@@ -205,9 +208,13 @@ class RayEngine:
         text = f"node {self._address_of(slot.node)} is refused: {why}; install the same version of tab-marl there"
         self._refused[slot.node] = text
         self._note(text)
-        able = [n["NodeID"] for n in self._nodes() if n["Resources"].get("CPU", 0) >= 1]
-        if all(name in self._refused for name in able):
-            raise UserError(f"no node of the cluster can play these episodes: {text}")
+        self._check_refused(self._nodes())
+
+    def _check_refused(self, nodes: list[dict[str, Any]]) -> None:
+        """Raises UserError if every node that is there was refused; asked again as nodes leave."""
+        able = [node["NodeID"] for node in nodes if node["Resources"].get("CPU", 0) >= 1]
+        if able and all(name in self._refused for name in able):
+            raise UserError(f"no node of the cluster can play these episodes: {self._refused[able[-1]]}")
 
     def _drop(self, slot: _Slot) -> None:
         self._slots.remove(slot)
