@@ -225,9 +225,10 @@ def failed_episodes(store: Store, key: str) -> list[Key]:
     rows = store.rows(key)
     failed = [r.key for r in rows if r.error is not None]
     first: dict[tuple[str, str, str], int] = {}
-    for *chain, seed in failed:
-        if chain[2] in LEARNS_ACROSS_EPISODES:
-            first[tuple(chain)] = min(seed, first.get(tuple(chain), seed))
+    for mission, family, planner, seed in failed:
+        if planner in LEARNS_ACROSS_EPISODES:
+            chain = (mission, family, planner)
+            first[chain] = min(seed, first.get(chain, seed))
     later = [r.key for r in rows if r.error is None and r.seed > first.get(r.key[:3], r.seed)]
     return failed + later
 

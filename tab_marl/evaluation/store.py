@@ -217,7 +217,8 @@ class Store:
 def _timing(values: Sequence[Any]) -> Timing:
     """From the columns `MEASURED`; what was not measured is nan there (SQLite has no nan)."""
     known = dict(zip(MEASURED, values, strict=True))
-    return Timing(**{k: float("nan") if v is None and k != "traceback" else v for k, v in known.items()})
+    filled: dict[str, Any] = {k: float("nan") if v is None and k != "traceback" else v for k, v in known.items()}
+    return Timing(**filled)
 
 
 def _connect(path: Path, read_only: bool = False) -> sqlite3.Connection:

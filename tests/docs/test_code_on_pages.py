@@ -31,7 +31,7 @@ def test_code(name: str, block: str, tmp_path: Path, monkeypatch: pytest.MonkeyP
 
         PPO("MlpPolicy", "tab_marl/Adversary-M4-v0", n_steps=8, batch_size=8, device="cpu").save("adversary.zip")
     names: dict[str, object] = {}
-    small = block.replace("model.learn(300_000)", "model.learn(64)").replace("n_steps=256", "n_steps=8")
+    small = re.sub(r"model\.learn\([\d_]+\)", "model.learn(64)", block).replace("n_steps=256", "n_steps=8")
     small = small.replace("batch_size=1024", "batch_size=16").replace("n_envs=8", "n_envs=2")
     exec(compile(small, name, "exec"), names)  # noqa: S102, our own page
     if "picture" in names:

@@ -182,7 +182,8 @@ class RayEngine:
             answer = self._ray.get(ref)
         except self._ray.exceptions.RayTaskError as error:
             if ticket is None:
-                return self._refuse(slot, _last_line(error))
+                self._refuse(slot, _last_line(error))
+                return None
             return Outcome(ticket, None, _last_line(error))
         except self._ray.exceptions.RayError as error:
             self._drop(slot)
@@ -196,8 +197,9 @@ class RayEngine:
             self._warm.add(slot.node)
             return Outcome(ticket, answer)
         if found := differences(self._identity, answer):
-            return self._refuse(slot, found)
-        slot.checked = True
+            self._refuse(slot, found)
+        else:
+            slot.checked = True
         return None
 
     def _refuse(self, slot: _Slot, why: str) -> None:
