@@ -21,9 +21,11 @@ def test_every_package_on_disk_is_listed() -> None:
 
 
 def test_package_data_patterns_match_files() -> None:
-    folders = {"tab_marl.agents": ROOT / "agents", "tab_marl.envs": ROOT / "envs"}
     for package, patterns in PROJECT["tool"]["setuptools"]["package-data"].items():
-        folder = folders.get(package, ROOT / package.replace(".", "/"))
+        name = (
+            package.removeprefix("tab_marl.") if package.startswith(("tab_marl.agents", "tab_marl.envs")) else package
+        )
+        folder = ROOT / name.replace(".", "/")
         for pattern in patterns:
             assert list(folder.glob(pattern)), f"{package}: nothing matches {pattern}"
 

@@ -12,7 +12,7 @@ import torch
 from stable_baselines3 import A2C, PPO, SAC
 
 from tab_marl.agents.opponents import load_model, load_opponent
-from tab_marl.agents.policies.zoo import PolicyError, ZooPolicy, load_zoo
+from tab_marl.agents.policies.zoo import SHIPPED, PolicyError, ZooPolicy, load_zoo
 from tab_marl.envs.opponents import Model
 from tab_marl.envs.single_agent import adversary_env, ego_env
 from tab_marl.world.scenario import UnknownName
@@ -32,7 +32,7 @@ def test_a_zoo_policy_is_one_argument() -> None:
         assert env.inner.adversary_style == policy.style  # type: ignore[attr-defined]
         ends.append(env.inner.episode.motion)  # type: ignore[attr-defined]
     assert ends[0] == ends[1] and ends[0][1].v > 0
-    folder = Path(load_zoo.__code__.co_filename).parent / "zoo" / policy.name
+    folder = SHIPPED / policy.name
     assert isinstance(load_opponent(str(folder), "adversary"), ZooPolicy)
 
 
