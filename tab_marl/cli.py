@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from tab_marl.evaluation.errors import UserError
+from tab_marl.evaluation.errors import UserError, user_message
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -375,30 +375,6 @@ def main() -> NoReturn:
             EXIT_BUG,
         )
     sys.exit(status if isinstance(status, int) else 0)
-
-
-def user_message(error: Exception) -> str | None:
-    """One line for an error that the user can mend; None for one that is ours."""
-    import sqlite3
-
-    if any(kind.__module__.startswith("tab_marl.") for kind in type(error).__mro__):
-        return one_line(str(error))  # every exception that the package defines is written for its users
-    if hasattr(error, "format_message"):  # the command line parser's own errors
-        return " ".join(str(error.format_message()).split())
-    if isinstance(error, OSError):
-        name = f"{error.filename}: " if error.filename else ""
-        return f"{name}{error.strerror or error}"
-    if isinstance(error, sqlite3.OperationalError):
-        return f"the store cannot be used: {error}"
-    if isinstance(error, MemoryError):
-        return "out of memory: use fewer --workers"
-    return None
-
-
-def one_line(text: str) -> str:
-    """The text on one line, without carets that point at a line above."""
-    lines = [" ".join(line.split()) for line in text.splitlines() if line.strip(" ^")]
-    return "; ".join(lines).replace(":; ", ": ")
 
 
 def _fail(message: str, status: int) -> NoReturn:

@@ -15,6 +15,7 @@ import pytest
 
 from tab_marl import cli
 from tab_marl.evaluation import settings
+from tab_marl.evaluation.errors import user_message
 from tab_marl.evaluation.store import FILE_NAME
 
 SMALL = [
@@ -148,7 +149,7 @@ def test_a_bug_is_named_as_one(capsys, monkeypatch):
     ],
 )
 def test_errors_of_the_machine_have_words(error, message):
-    found = cli.user_message(error)
+    found = user_message(error)
     assert found is None if message is None else message in found
 
 

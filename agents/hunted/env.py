@@ -9,15 +9,13 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Box
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env import VecEnv
 
 from tab_marl.agents.hunted.egos import SEEDS, Hunters, hunter_names
 from tab_marl.agents.planners import PlannerOptions
-from tab_marl.agents.training.env import TRAINING, WINDOW, draw_tasks
+from tab_marl.agents.training.env import TRAINING, WINDOW, TrainingEnv, draw_tasks
 from tab_marl.agents.training.settings import TrainingSettings
-from tab_marl.envs.adversary_observation import AdversaryTask, observation_bounds
+from tab_marl.envs.adversary_observation import OBSERVED, AdversaryTask
 from tab_marl.envs.batched_arenas import EVENTS, BatchedArenas
 from tab_marl.envs.episode import draw_starts
 from tab_marl.envs.reward import SHAPED, AdversaryRewards
@@ -68,15 +66,13 @@ def hunted_env(settings: TrainingSettings, on_built: Callable[[int, int], None] 
     return HuntedVecEnv(built, kinds, settings.robots, settings.seed, settings.opponent)
 
 
-class HuntedVecEnv(VecEnv):
+class HuntedVecEnv(TrainingEnv):
     """N arenas; an ego drawn from `opponent` ("pursue", "FP-POMCP+TAB-POMCP", an SB3 ego's .zip) hunts in each.
 
     An arena whose episode ends begins one on another task of the bank, drawn by `weights` ``[K]`` (summing to 1), from
     starts drawn as `InterceptEnv` draws them. The reward: `REWARDS` and `VISIT_REWARD` per counted visit; a mission that
     the episode's end leaves open has failed.
     """
-
-    render_mode = None
 
     def __init__(
         self,
@@ -90,24 +86,18 @@ class HuntedVecEnv(VecEnv):
     ) -> None:
         """`tasks`: see `hunted_tasks`; `kinds`: the mission type of each; `options`: the planners'. Raises UnknownName for
         an ego that nobody knows."""
-        low, high = observation_bounds()
-        super().__init__(arenas, Box(low, high, dtype=np.float32), Box(-1.0, 1.0, (2,), np.float32))
         if len(kinds) != len(tasks):
             raise ValueError(f"there are {len(kinds)} kinds for {len(tasks)} tasks: give each task's mission type")
+        super().__init__(arenas, kinds)
         self.rng = np.random.default_rng((seed, 11))
-        self.kinds = tuple(kinds)
-        """Mission type of each task."""
-        self.weights = np.full(len(tasks), 1.0 / len(tasks))
-        self.recent: dict[str, list[float]] = {kind: [] for kind in sorted(set(kinds))}
         self.recently_caught: list[float] = []
-        self.observation = np.zeros((arenas, len(low)), dtype=np.float32)
+        self.observation = np.zeros((arenas, OBSERVED), dtype=np.float32)
         """``[N, 40]`` what the adversaries observe now."""
         self.hunters = Hunters(hunter_names(opponent), arenas, options)
         self.arenas = BatchedArenas(tasks, arenas, end_on_completion=True, adversary_rewards=rewards)
         self._failed_price = rewards.failed
         self._tasks = [Task(task.scenario, task.mission, "", "custom", 0.0) for task in tasks]
         longest = max(round(task.scenario.horizon_seconds * task.scenario.control_hertz) for task in tasks)
-        self._action = np.zeros((arenas, 2), dtype=np.float32)
         self._ego = np.zeros((arenas, self.arenas.observed_by_ego), dtype=np.float32)
         self._returns = np.zeros(arenas)
         self._visits = np.zeros(arenas, dtype=np.int64)
@@ -136,9 +126,6 @@ class HuntedVecEnv(VecEnv):
         self._begin(np.arange(self.num_envs))
         return self.observation.copy()
 
-    def step_async(self, actions: NDArray[np.float32]) -> None:
-        self._action = np.asarray(actions, dtype=np.float32)
-
     def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         arenas = self.arenas
         rows = np.arange(self.num_envs)
@@ -156,10 +143,9 @@ class HuntedVecEnv(VecEnv):
                 "completed": completed,
                 "intercepted": caught,
             }
-            recent = self.recent[self.kinds[arenas.task[i]]]
-            recent.append(float(completed))
+            self.record(int(arenas.task[i]), completed)
             self.recently_caught.append(float(caught))
-            del recent[:-WINDOW], self.recently_caught[:-WINDOW]
+            del self.recently_caught[:-WINDOW]
         if len(ended):
             self._begin(ended)
         return self.observation.copy(), reward.astype(np.float32), done, infos
@@ -174,10 +160,6 @@ class HuntedVecEnv(VecEnv):
         self._visits = visits
         self._returns += reward
         return reward, outcome.terminated | outcome.truncated, outcome.events
-
-    def success(self) -> dict[str, float]:
-        """Share of completed missions per mission type over the last episodes (nan before the first)."""
-        return {kind: float(np.mean(recent)) if recent else float("nan") for kind, recent in self.recent.items()}
 
     def snapshot(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         """Everything that what follows depends on: arrays, and JSON values. Call it between steps."""
@@ -225,19 +207,3 @@ class HuntedVecEnv(VecEnv):
         self.weights = arrays["weights"].copy()
         self.recent, self.recently_caught = text["recent"], text["caught"]
         self.rng.bit_generator.state = text["random"]
-
-    # What VecEnv asks for beside that; the arenas have no attributes of their own.
-    def close(self) -> None:
-        pass
-
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
-
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        setattr(self, attr_name, value)
-
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        raise AttributeError(f"the hunted world has no method {method_name!r} per arena")
-
-    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
-        return [False] * len(list(self._get_indices(indices)))

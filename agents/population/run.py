@@ -7,16 +7,15 @@ others go on; whatever is killed, the same call continues every member from its 
 from __future__ import annotations
 
 import multiprocessing as mp
-import os
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
 from tab_marl.agents.population.members import Population
+from tab_marl.agents.processes import SINGLE_THREADED, environment
 from tab_marl.agents.training.algorithms import ALGORITHMS
 from tab_marl.agents.training.settings import UNOPPOSED, TrainingError, TrainingSettings
 
@@ -30,7 +29,6 @@ HUNTED_FACTOR = 20.0
 EPISODE_SECONDS = 1.5
 """CPU seconds of an episode in which a planner hunts."""
 POLL_SECONDS = 1.0
-_ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
 @dataclass(frozen=True)
@@ -89,7 +87,7 @@ def train_population(
     running: dict[Any, tuple[str, Any]] = {}
     context = mp.get_context("spawn")
     try:
-        with _one_thread():
+        with environment(SINGLE_THREADED):
             while queue or running:
                 while queue and len(running) < workers:
                     stand = queue.pop(0)
@@ -153,21 +151,6 @@ def _work(settings: TrainingSettings, folder: Path, command: str, send: Connecti
         send.send({"status": FAILED, "error": " ".join(f"{type(error).__name__}: {error}".split())})
     finally:
         send.close()
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Processes started inside compute with one thread each."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 def stand_of(settings: TrainingSettings, out_dir: Path) -> MemberStand:

@@ -76,28 +76,65 @@ def build_bank(
     return Bank.of(built)
 
 
-class BatchedVecEnv(VecEnv):
-    """N robots that begin a new task of the bank whenever theirs has ended.
+class TrainingEnv(VecEnv):
+    """What the training worlds share as vector environments of the adversary: N robots on the tasks of a bank.
 
     `weights` ``[K]`` (summing to 1) is the probability of each task of the bank.
     """
 
     render_mode = None
+
+    def __init__(self, robots: int, kinds: Sequence[str]) -> None:
+        low, high = observation_bounds()
+        super().__init__(robots, Box(low, high, dtype=np.float32), Box(-1.0, 1.0, (2,), np.float32))
+        self.kinds = tuple(kinds)
+        """Mission type of each task."""
+        self.weights = np.full(len(kinds), 1.0 / len(kinds))
+        self.recent: dict[str, list[float]] = {kind: [] for kind in sorted(set(kinds))}
+        self._action = np.zeros((robots, 2), dtype=np.float32)
+
+    def step_async(self, actions: NDArray[np.float32]) -> None:
+        self._action = np.asarray(actions, dtype=np.float32)
+
+    def record(self, task: int, completed: bool) -> None:
+        """An episode on this task of the bank has ended."""
+        recent = self.recent[self.kinds[task]]
+        recent.append(float(completed))
+        del recent[:-WINDOW]
+
+    def success(self) -> dict[str, float]:
+        """Share of completed missions per mission type over the last episodes (nan before the first)."""
+        return {kind: float(np.mean(recent)) if recent else float("nan") for kind, recent in self.recent.items()}
+
+    # What VecEnv asks for beside that; there is one world, so robots have no attributes of their own.
+    def close(self) -> None:
+        pass
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        setattr(self, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        raise AttributeError(f"the training world has no method {method_name!r} per robot")
+
+    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+        return [False] * len(list(self._get_indices(indices)))
+
+
+class BatchedVecEnv(TrainingEnv):
+    """N robots that begin a new task of the bank whenever theirs has ended."""
+
     KEPT = ("task", "state", "location", "clocks", "memory", "ghost", "potential", "observation")
     """Arrays of the world that the rest of a run depends on."""
 
     def __init__(self, bank: Bank, kinds: Sequence[str], robots: int, seed: int, seen_metres: float = 0.0) -> None:
-        low, high = observation_bounds()
-        super().__init__(robots, Box(low, high, dtype=np.float32), Box(-1.0, 1.0, (2,), np.float32))
+        super().__init__(robots, kinds)
         self.world = BatchedWorld(bank, robots, np.random.default_rng((seed, 7)))
         self.world.seen_metres = seen_metres
-        self.kinds = tuple(kinds)
-        """Mission type of each task."""
-        self.weights = np.full(len(bank), 1.0 / len(bank))
         self.returns = np.zeros(robots)
         self.ticks = np.zeros(robots, dtype=np.int64)
-        self.recent: dict[str, list[float]] = {kind: [] for kind in sorted(set(kinds))}
-        self._action = np.zeros((robots, 2), dtype=np.float32)
 
     def _begin(self, which: NDArray[np.int64]) -> None:
         self.world.begin(which, self.world.rng.choice(len(self.weights), size=len(which), p=self.weights))
@@ -107,9 +144,6 @@ class BatchedVecEnv(VecEnv):
         self.returns[:] = 0
         self.ticks[:] = 0
         return self.world.observation.copy()
-
-    def step_async(self, actions: NDArray[np.float32]) -> None:
-        self._action = actions
 
     def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         world = self.world
@@ -127,17 +161,11 @@ class BatchedVecEnv(VecEnv):
                     "terminal_observation": world.observation[i].copy(),
                     "episode": {"r": float(self.returns[i]), "l": int(self.ticks[i]), "t": 0.0},
                 }
-                recent = self.recent[self.kinds[world.task[i]]]
-                recent.append(float(completed[i]))
-                del recent[:-WINDOW]
+                self.record(int(world.task[i]), bool(completed[i]))
             self.returns[ended] = 0
             self.ticks[ended] = 0
             self._begin(ended)
         return world.observation.copy(), reward, done, infos
-
-    def success(self) -> dict[str, float]:
-        """Share of completed missions per mission type over the last episodes (nan before the first)."""
-        return {kind: float(np.mean(recent)) if recent else float("nan") for kind, recent in self.recent.items()}
 
     def snapshot(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         """Everything that the rest of a run depends on: arrays by name, and what goes into JSON."""
@@ -152,19 +180,3 @@ class BatchedVecEnv(VecEnv):
         self.returns[:], self.ticks[:] = arrays["returns"], arrays["ticks"]
         self.world.rng.bit_generator.state = text["random"]
         self.recent = {kind: list(shares) for kind, shares in text["recent"].items()}
-
-    # What VecEnv asks for beside that; there is one world, so no per-robot attributes.
-    def close(self) -> None:
-        pass
-
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
-
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        setattr(self, attr_name, value)
-
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        raise AttributeError(f"the batched world has no method {method_name!r} per robot")
-
-    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
-        return [False] * len(list(self._get_indices(indices)))

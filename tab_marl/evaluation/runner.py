@@ -68,22 +68,14 @@ def run(
     An episode whose worker dies is tried again on another, `ATTEMPTS` times in all, and then stored with the error.
     Raises Interrupted after Ctrl-C (everything finished is stored) and UserError if workers do nothing but die.
     """
-    _Runner(settings, adversaries, store, key, engine, run_id, watch or Watch()).run()
+    work = _Work(Schedule(settings, adversaries, store.keys(key)))
+    _Runner(work, store, key, engine, run_id, watch or Watch()).run()
 
 
 class _Runner:
-    def __init__(
-        self,
-        settings: EvaluationSettings,
-        adversaries: tuple[str, ...],
-        store: Store,
-        key: str,
-        engine: Engine,
-        run_id: int,
-        watch: Watch,
-    ) -> None:
+    def __init__(self, work: _Work, store: Store, key: str, engine: Engine, run_id: int, watch: Watch) -> None:
+        self._work = work
         self._store, self._key, self._engine, self._run, self._watch = store, key, engine, run_id, watch
-        self._work = _Work(Schedule(settings, adversaries, store.keys(key)))
         self._tickets = 0
         self._last_beat = time.monotonic()
 

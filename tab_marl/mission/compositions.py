@@ -38,6 +38,7 @@ from tab_marl.mission.tasks import (
     TURN_SECONDS,
     Task,
     Travel,
+    draw_ego_start,
     half_seconds,
 )
 from tab_marl.world.grid import GridMap
@@ -121,12 +122,7 @@ def _attempt(rng: np.random.Generator, scenario: Scenario, name: str, slack: flo
     legs = TURN_SECONDS + (legs - TURN_SECONDS) * slowed
     mission, horizon = _mission(name, plan, legs, slack, scenario)
     meets = np.all([travel.ego_meets(way.path) for way in ways], axis=0)
-
-    def fair(points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        apart = np.hypot(points[:, 0] - start.x, points[:, 1] - start.y) >= FAR_METRES
-        return np.asarray(meets & apart)
-
-    ego = sample_disc(rng, grid, 0.05, fair)
+    ego = draw_ego_start(rng, grid, meets, start, FAR_METRES)
     if ego is None:
         return None
     scenario = replace(scenario, ego_start=ego, adversary_start=start, horizon_seconds=horizon)

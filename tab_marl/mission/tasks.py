@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from tab_marl.mission.model import Constraint, ConstraintType, Mission, Place
 from tab_marl.world.grid import GridMap
-from tab_marl.world.regions import Region
+from tab_marl.world.regions import Disc, Region
 from tab_marl.world.sampling import PLANNING_CELL_METRES, MapOptions, sample_disc, sample_scenario
 from tab_marl.world.scenario import STRICT, Scenario, UnknownName
 
@@ -150,16 +150,23 @@ def _attempt(
         return None
     mission, horizon = _mission(mission_id, legs, travel, ways, slack)
     meets = np.all([travel.ego_meets(way.path) for way in ways], axis=0)
+    ego = draw_ego_start(rng, grid, meets, start, far_metres)
+    if ego is None:
+        return None
+    scenario = replace(scenario, ego_start=ego, adversary_start=start, horizon_seconds=horizon)
+    return Task(scenario, mission, mission_id, family, round(slack, 3))
+
+
+def draw_ego_start(
+    rng: np.random.Generator, grid: GridMap, meets: NDArray[np.bool_], start: Disc, far_metres: float
+) -> Disc | None:
+    """A start from which the ego can be first (`meets` ``[S]``) and that lies far from the adversary's; None if none does."""
 
     def fair(points: NDArray[np.float64]) -> NDArray[np.bool_]:
         apart = np.hypot(points[:, 0] - start.x, points[:, 1] - start.y) >= far_metres
         return np.asarray(meets & apart)
 
-    ego = sample_disc(rng, grid, 0.05, fair)
-    if ego is None:
-        return None
-    scenario = replace(scenario, ego_start=ego, adversary_start=start, horizon_seconds=horizon)
-    return Task(scenario, mission, mission_id, family, round(slack, 3))
+    return sample_disc(rng, grid, 0.05, fair)
 
 
 def _widen(rng: np.random.Generator, scenario: Scenario, order: NDArray[np.int_], mission_id: str) -> Scenario | None:

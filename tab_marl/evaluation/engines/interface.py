@@ -14,11 +14,6 @@ Result = tuple[EpisodeRow, Timing]
 Play = Callable[[Job], list[Result]]
 """A function of a module, so that other processes find it by name."""
 
-# One process per core already: libraries that start threads of their own only get in each other's way.
-SINGLE_THREADED = {
-    name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-}
-
 
 @dataclass(frozen=True)
 class Outcome:

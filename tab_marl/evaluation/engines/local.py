@@ -15,7 +15,8 @@ from multiprocessing.synchronize import Event
 from types import TracebackType
 from typing import Any, Self
 
-from tab_marl.evaluation.engines.interface import SINGLE_THREADED, Outcome, Play
+from tab_marl.agents.processes import SINGLE_THREADED, environment
+from tab_marl.evaluation.engines.interface import Outcome, Play
 from tab_marl.evaluation.errors import Interrupted
 from tab_marl.evaluation.units import Job
 
@@ -167,21 +168,6 @@ def pool(workers: int) -> Iterator[tuple[ProcessPoolExecutor, Event]]:
         finally:
             stop.set()
             executor.shutdown(wait=True, cancel_futures=True)
-
-
-@contextlib.contextmanager
-def environment(values: dict[str, str]) -> Iterator[None]:
-    """These environment variables inside, and what was there before afterwards."""
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 def begin_worker(stop: Any) -> None:

@@ -56,6 +56,14 @@ def dynamics_of(model: Any, likelihood: Callable[..., float] | None) -> Particle
     return PythonDynamics(model, given)
 
 
+def _drawn(
+    model: CompiledModel | ContinuousModel, belief: Any, count: int, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """`count` rows of a belief's states, drawn by their weights."""
+    states, weights = belief_states(model, belief, count, rng)
+    return states[draw_particles(count, len(states), weights, rng)]
+
+
 class CompiledDynamics:
     """Particles of a `CompiledModel`: rows of an array."""
 
@@ -70,8 +78,7 @@ class CompiledDynamics:
             self._likelihood = callback(plain, signature)
 
     def draw(self, belief: Any, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-        states, weights = belief_states(self.model, belief, count, rng)
-        return states[draw_particles(count, len(states), weights, rng)]
+        return _drawn(self.model, belief, count, rng)
 
     def advance(
         self, states: NDArray[np.float64], action: int, observation: Any, rng: np.random.Generator
@@ -94,8 +101,7 @@ class ContinuousDynamics:
         self.model = model
 
     def draw(self, belief: Any, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-        states, weights = belief_states(self.model, belief, count, rng)
-        return states[draw_particles(count, len(states), weights, rng)]
+        return _drawn(self.model, belief, count, rng)
 
     def advance(
         self, states: NDArray[np.float64], action: int, observation: Any, rng: np.random.Generator

@@ -23,8 +23,21 @@ def check_horizon(discount: float, max_depth: int | None, tree_depth: int | None
     require(tree_depth is None or tree_depth >= 0, "tree_depth", tree_depth, ">= 0")
 
 
-def horizon_of(discount: float, max_depth: int | None) -> int:
-    """`max_depth`, or the depth that the discount implies."""
-    if max_depth is not None:
-        return max_depth
-    return max(1, math.ceil(math.log(PRECISION) / math.log(discount)))
+class Depths:
+    """How deep a search looks, from its options."""
+
+    discount: float
+    max_depth: int | None
+    tree_depth: int | None
+
+    @property
+    def horizon(self) -> int:
+        """`max_depth`, or the depth that the discount implies."""
+        if self.max_depth is not None:
+            return self.max_depth
+        return max(1, math.ceil(math.log(PRECISION) / math.log(self.discount)))
+
+    @property
+    def deepest_node(self) -> int:
+        """`tree_depth`, or the horizon."""
+        return self.horizon if self.tree_depth is None else min(self.tree_depth, self.horizon)

@@ -29,7 +29,7 @@ from tab_marl.planning.model import (
     warn_of_plain_python,
 )
 from tab_marl.planning.search import despot_kernels as kernels
-from tab_marl.planning.search.bounds import check_horizon, horizon_of, require
+from tab_marl.planning.search.bounds import Depths, check_horizon, require
 from tab_marl.planning.search.despot_interpreted import search_in_python
 from tab_marl.planning.search.growing import Chunks, grown, table_size
 from tab_marl.planning.search.kernels import UNEXPANDED
@@ -62,7 +62,7 @@ DESPOT_EDGE = np.dtype(
 
 
 @dataclass(frozen=True)
-class DespotOptions:
+class DespotOptions(Depths):
     """How to search. Raises ValueError naming the field, its value and its bounds."""
 
     scenarios: int = 500
@@ -120,16 +120,6 @@ class DespotOptions:
             raise ValueError(
                 "lower is 'trivial' and reward_bounds is None: give the (least, greatest) reward of a step"
             )
-
-    @property
-    def horizon(self) -> int:
-        """`max_depth`, or the depth that the discount implies."""
-        return horizon_of(self.discount, self.max_depth)
-
-    @property
-    def deepest_node(self) -> int:
-        """`tree_depth`, or the horizon."""
-        return self.horizon if self.tree_depth is None else min(self.tree_depth, self.horizon)
 
     @property
     def max_rows(self) -> int:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tab_marl.planning.model import CompiledModel, belief_states, check_model, check_numbered, warn_of_plain_python
-from tab_marl.planning.search.bounds import check_horizon, horizon_of, require
+from tab_marl.planning.search.bounds import Depths, check_horizon, require
 from tab_marl.planning.search.growing import grow_tree_compiled
 from tab_marl.planning.search.interpreted import asked_prior, grow_tree_in_python
 from tab_marl.planning.search.plan import Plan, action_numbers, decided
@@ -26,7 +26,7 @@ __all__ = ["Plan", "Pomcp", "PomcpOptions"]
 
 
 @dataclass(frozen=True)
-class PomcpOptions:
+class PomcpOptions(Depths):
     """How to search. Raises ValueError naming the field, its value and its bounds."""
 
     simulations: int = 2000
@@ -66,16 +66,6 @@ class PomcpOptions:
         require(1 <= self.workers <= 1024, "workers", self.workers, "in [1, 1024]")
         require(1 <= self.max_nodes <= 2**30, "max_nodes", self.max_nodes, "in [1, 2^30]")
         require(self.choose in ("value", "visits"), "choose", self.choose, "'value' or 'visits'")
-
-    @property
-    def horizon(self) -> int:
-        """`max_depth`, or the depth that the discount implies."""
-        return horizon_of(self.discount, self.max_depth)
-
-    @property
-    def deepest_node(self) -> int:
-        """`tree_depth`, or the horizon."""
-        return self.horizon if self.tree_depth is None else min(self.tree_depth, self.horizon)
 
 
 @dataclass(frozen=True, eq=False)

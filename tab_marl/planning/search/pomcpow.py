@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tab_marl.planning.model import CompiledModel, ContinuousModel, belief_states, check_model, warn_of_plain_python
 from tab_marl.planning.search import pomcpow_kernels as kernels
-from tab_marl.planning.search.bounds import check_horizon, horizon_of, require
+from tab_marl.planning.search.bounds import Depths, check_horizon, require
 from tab_marl.planning.search.growing import (
     INVERSE_ROOT,
     ROOT_LOG,
@@ -42,7 +42,7 @@ _POWERS = 65536
 
 
 @dataclass(frozen=True)
-class PomcpowOptions:
+class PomcpowOptions(Depths):
     """How to search. Raises ValueError naming the field, its value and its bounds."""
 
     simulations: int = 2000
@@ -85,16 +85,6 @@ class PomcpowOptions:
         require(1 <= self.max_particles <= 2**40, "max_particles", self.max_particles, "in [1, 2^40]")
         require(1 <= self.workers <= 1024, "workers", self.workers, "in [1, 1024]")
         require(self.choose in ("value", "visits"), "choose", self.choose, "'value' or 'visits'")
-
-    @property
-    def horizon(self) -> int:
-        """`max_depth`, or the depth that the discount implies."""
-        return horizon_of(self.discount, self.max_depth)
-
-    @property
-    def deepest_node(self) -> int:
-        """`tree_depth`, or the horizon."""
-        return self.horizon if self.tree_depth is None else min(self.tree_depth, self.horizon)
 
 
 @dataclass(frozen=True, eq=False)
