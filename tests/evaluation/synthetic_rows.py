@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -83,13 +84,25 @@ def play_slowly(job: Job):
     return play(job)
 
 
-def play_saying_where(job: Job):
-    """On a Ray cluster: the timing's text is the node that played."""
+def play_where_a_node_dies(job: Job):
+    """On a Ray cluster: the timing's text is the node that played; one node dies while it plays, after all have begun.
+
+    The folder SYNTHETIC_NODES holds a file per node that began, and `head`, whose text is the node the cluster stands on.
+    """
     import dataclasses
 
     import ray
 
-    node = ray.get_runtime_context().get_node_id()
+    node, folder = ray.get_runtime_context().get_node_id(), Path(os.environ["SYNTHETIC_NODES"])
+    (folder / f"node-{node}").touch()
+    deadline = time.monotonic() + 120
+    while len(list(folder.glob("node-*"))) < 3 and time.monotonic() < deadline:
+        time.sleep(0.02)
+    if job.unit.seed >= 4 and node != (folder / "head").read_text():
+        with contextlib.suppress(FileExistsError):
+            (folder / "died").touch(exist_ok=False)
+            os.kill(os.getppid(), signal.SIGKILL)  # a worker's parent is its node's raylet
+            time.sleep(60)  # the episode is not finished: workers of a dead raylet end
     time.sleep(0.05)
     return [(row, dataclasses.replace(spent, traceback=node)) for row, spent in play(job)]
 

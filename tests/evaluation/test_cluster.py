@@ -25,23 +25,21 @@ SMALL = {"num_cpus": 1, "object_store_memory": 80 * 2**20, "include_dashboard": 
 
 
 @pytest.fixture(scope="module")
-def cluster():
+def cluster(tmp_path_factory):
     """Three nodes of a processor each."""
-    before = {name: os.environ.get(name) for name in ("PYTHONPATH", "RAY_USAGE_STATS_ENABLED")}
-    here = str(Path(__file__).parent)
-    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [here, before["PYTHONPATH"]]))
-    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-    made = Cluster(initialize_head=True, head_node_args={**SMALL, "include_log_monitor": False})
-    for _ in range(2):
-        made.add_node(wait=False, **SMALL)
-    made.wait_for_nodes()
-    yield made
-    ray.shutdown()
-    made.shutdown()
-    for name, value in before.items():
-        os.environ.pop(name, None)
-        if value is not None:
-            os.environ[name] = value
+    here, nodes = str(Path(__file__).parent), tmp_path_factory.mktemp("nodes")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")])))
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        patch.setenv("SYNTHETIC_NODES", str(nodes))
+        made = Cluster(initialize_head=True, head_node_args={**SMALL, "include_log_monitor": False})
+        (nodes / "head").write_text(made.head_node.node_id)
+        for _ in range(2):
+            made.add_node(wait=False, **SMALL)
+        made.wait_for_nodes()
+        yield made
+        ray.shutdown()
+        made.shutdown()
 
 
 @pytest.fixture(scope="module")
@@ -55,13 +53,10 @@ def test_killing_a_node_changes_no_row(cluster, ours, tmp_path, synthetic):
 
     def on_result(results):
         nodes_seen.update(timing.traceback for _, timing in results)
-        with Store.open(tmp_path) as other:
-            if len(other.keys("k")) > 24 and len(cluster.worker_nodes) == 2:
-                cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
 
     with Store.create(tmp_path) as store:
         store.use("k", {}, {})
-        engine = RayEngine(synthetic.play_saying_where, ours, cluster.address)
+        engine = RayEngine(synthetic.play_where_a_node_dies, ours, cluster.address)
         run_id = store.begin_run("k", {})
         run(SETTINGS, ("a", "b"), store, "k", engine, run_id, Watch(on_result, on_note=notes.append))
         rows = {row.key: (row, store.learned("k", *row.key)) for row in store.rows("k")}
@@ -69,7 +64,6 @@ def test_killing_a_node_changes_no_row(cluster, ours, tmp_path, synthetic):
         key: (repr(_without_learned(row)), learned) for key, (row, learned) in expected.items()
     }
     assert len(rows) == 72
-    assert len(cluster.worker_nodes) == 1, "the node was killed while episodes were left"
     assert len(nodes_seen) == 3, "every node had played"
     assert any("a worker was lost (on node" in note and "trying again" in note for note in notes)
 
