@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from tab_marl.mission.route_kernels import MOVE_X, MOVE_Y
 from tab_marl.world.grid import GridMap
+from tab_marl.world.regions import Region
 from tab_marl.world.scenario import STRICT, Scenario, UnknownName
 
 SLACK_NEEDED = 1.2
@@ -28,8 +29,8 @@ STRENGTHS = (1.0, 0.5, 0.25)
 ZONE_MARGIN_METRES = 0.12
 ZONE_MARGIN_COST = 3.0
 WALL_SIDE_COST = 1.15
-BEATEN_METRES, BEATEN_ENDS = 0.3, 0.15
-"""A contrary adversary keeps so far from the shortest way, but for this share of it at either end."""
+FENCE_METRES = 0.3
+"""Width of the strip whose crossing costs a contrary adversary; moves are at most 0.23 m long."""
 NOISE_METRES = 0.5
 """Distance between the independent values of the random cost field."""
 WEIGHT_SLIP = 1e-3
@@ -52,8 +53,8 @@ class Style:
     """Cells under a camera cost 1 + this."""
     edge_noise: float = 0.0
     """Standard deviation of the logarithm of a smooth random cost field."""
-    contrary: float = 0.0
-    """Cells along the middle of the shortest way cost 1 + this: another way, round the other side, comes first."""
+    contrary_metres: float = 0.0
+    """So many metres more it goes to pass an obstacle on another side than the shortest way does, on the first leg."""
     order_metres: float = 0.0
     """Each place that could be visited costs up to this many metres more, drawn per episode: soft order, soft choice."""
     arrival_fraction: tuple[float, float] | None = None
@@ -67,7 +68,7 @@ class Style:
         for name in ("side", "via"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"Style.{name} is {getattr(self, name)}, must be a probability in 0..1")
-        for name in ("side_cost", "camera_shy", "edge_noise", "contrary", "order_metres"):
+        for name in ("side_cost", "camera_shy", "edge_noise", "contrary_metres", "order_metres"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"Style.{name} is {getattr(self, name)}, must be >= 0")
         if not 0 <= self.via_points_max <= 2:
@@ -120,7 +121,7 @@ class Style:
             via_points=1 + int(via_share * self.via_points_max) if via_on < self.via and self.via_points_max else 0,
             camera_shy=self.camera_shy,
             edge_noise=self.edge_noise,
-            contrary=self.contrary,
+            contrary_metres=self.contrary_metres,
             order_metres=self.order_metres,
             arrival_fraction=low + fraction * (high - low),
             seed=seed,
@@ -155,7 +156,7 @@ class Latents:
     via_points: int = 0
     camera_shy: float = 0.0
     edge_noise: float = 0.0
-    contrary: float = 0.0
+    contrary_metres: float = 0.0
     order_metres: float = 0.0
     arrival_fraction: float = 0.0
     """Share of the allowed time at which to arrive; 0: as soon as possible."""
@@ -164,8 +165,8 @@ class Latents:
 
     @property
     def bends_route(self) -> bool:
-        return bool(
-            self.side or self.via_points or self.camera_shy or self.edge_noise or self.contrary or self.order_metres
+        return any(
+            (self.side, self.via_points, self.camera_shy, self.edge_noise, self.contrary_metres, self.order_metres)
         )
 
 
@@ -179,7 +180,7 @@ STYLES: dict[str, Style] = {
         Style("late", arrival_fraction=(0.75, 0.9), order_metres=2.0),
         Style("wander", edge_noise=1.0, order_metres=2.0),
         Style("fickle", order_metres=6.0),
-        Style("contrary", contrary=3.0, order_metres=2.0),
+        Style("contrary", contrary_metres=1.5, order_metres=2.0),
     )
 }
 
@@ -215,23 +216,37 @@ def clearance_cost(grid: GridMap, zone_distance: NDArray[np.float64]) -> NDArray
     return np.where(zone_distance < ZONE_MARGIN_METRES, ZONE_MARGIN_COST, cost)
 
 
+def fence(grid: GridMap, regions: Sequence[Region], way: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """``[S]``: strips from the middle of each of these regions through the point of the way ``[K, 2]`` that is nearest to it.
+
+    The way crosses them all; one that passes a region on its other side does not cross that region's.
+    """
+    across = np.zeros(grid.cells, dtype=bool)
+    for region in regions:
+        nearest = int(np.argmin(region.distance(way)))
+        x_min, y_min, x_max, y_max = region.bounds()
+        middle = np.array([(x_min + x_max) / 2, (y_min + y_max) / 2])
+        length = float(np.hypot(*(way[nearest] - middle)))
+        if length == 0.0 or nearest in (0, len(way) - 1):
+            continue  # the way does not go past it
+        (x, y), offset = (way[nearest] - middle) / length, grid.centres - middle
+        aside = np.abs(offset[:, 0] * y - offset[:, 1] * x)
+        across |= (offset @ (x, y) >= 0) & (aside <= FENCE_METRES / 2)
+    return across
+
+
 def styled_cost(
     scenario: Scenario,
     grid: GridMap,
     clearance: NDArray[np.float64],
     latents: Latents,
     strength: float,
-    shortest: NDArray[np.float64],
+    fenced: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float64]:
-    """Costs ``[S, 16]`` of moves under these latents at this strength (0..1); `shortest` ``[K, 2]`` is the way without them."""
+    """Costs ``[S, 16]`` of moves under these latents at this strength (0..1); `fenced` ``[S]``: see `fence`."""
     cells = clearance.copy()
-    if latents.contrary:
-        skipped = int(len(shortest) * BEATEN_ENDS)
-        middle = shortest[skipped : len(shortest) - skipped]
-        near = np.zeros(grid.cells, dtype=bool)
-        for x, y in middle:
-            near |= np.hypot(grid.centres[:, 0] - x, grid.centres[:, 1] - y) < BEATEN_METRES
-        cells = cells * np.where(near, 1.0 + strength * latents.contrary, 1.0)
+    if fenced is not None:
+        cells = cells * np.where(fenced, 1.0 + strength * latents.contrary_metres / FENCE_METRES, 1.0)
     if latents.camera_shy:
         cells = cells * np.where(scenario.seen(grid.centres), 1.0 + strength * latents.camera_shy, 1.0)
     if latents.edge_noise:

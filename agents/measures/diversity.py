@@ -191,7 +191,7 @@ def own_figure(style: Style) -> tuple[str, Literal[1, -1]] | None:
     if style.name in OWN_FIGURE:
         return OWN_FIGURE[style.name]
     held = (
-        ("wander", bool(style.mixture)), ("late", style.arrival_fraction is not None), ("contrary", style.contrary > 0),
+        ("wander", bool(style.mixture)), ("late", style.arrival_fraction is not None), ("contrary", style.contrary_metres > 0),
         ("side", style.side > 0), ("via", style.via > 0), ("camera-shy", style.camera_shy > 0),
         ("wander", style.edge_noise > 0), ("fickle", style.order_metres >= SOFT_ORDER_METRES),
     )  # fmt: skip

@@ -4,7 +4,7 @@
     tasks = 360
 
     [[member]]
-    style = "side"                     # a preset, ["late", "fickle"] (one of them per episode), or a table
+    style = "side"                     # a preset, a table, or a list of either: ["late", "fickle"] is one of them per episode
 
     [[member]]
     name = "quiet"
@@ -22,6 +22,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
 
 from tab_marl.agents.training.hyperparameters import HyperparameterError, check
 from tab_marl.agents.training.settings import TrainingError, TrainingSettings, as_toml, read_toml
@@ -134,11 +136,19 @@ def _members(defaults: Mapping[str, Any], member: Mapping[str, Any], where: str)
     return [dataclasses.replace(first, name=f"{first.name}-{seed}", seed=seed) for seed in seeds]
 
 
-def _mixture(names: Sequence[Any], where: str) -> dict[str, Any]:
-    for name in names:
-        if name not in STYLES:
-            raise TrainingError(f"{where}: {UnknownName('style', str(name), STYLES)}")
-    if len(names) < 2:
-        raise TrainingError(f"{where}: style is {list(names)}, must name two or more styles, or be a single name")
-    mixed: Style = mixture_of("-".join(names), [STYLES[name] for name in names])
-    return as_toml(mixed)
+def _mixture(styles: Sequence[Any], where: str) -> dict[str, Any]:
+    """One of these per episode, each a preset's name or a table."""
+    found: list[Style] = []
+    for style in styles:
+        if isinstance(style, dict):
+            try:
+                found.append(TypeAdapter(Style).validate_python(style))
+            except ValidationError as error:
+                raise TrainingError(f"{where}: style {style}: {error.errors()[0]['msg']}") from None
+        elif isinstance(style, str) and style in STYLES:
+            found.append(STYLES[style])
+        else:
+            raise TrainingError(f"{where}: {UnknownName('style', str(style), STYLES)}")
+    if len(found) < 2:
+        raise TrainingError(f"{where}: style is {list(styles)}, must name two or more styles, or be a single name")
+    return as_toml(mixture_of("-".join(style.name for style in found), found))
