@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from tab_marl.envs import adversary_kernels as kernels
 from tab_marl.envs.adversary_tables import LATENT_MAX, Parts, Tables, later_windows, pack, zones
 from tab_marl.envs.reward import Gained
-from tab_marl.envs.styles import SLACK_NEEDED, STRENGTHS, Latents, Style, clearance_cost, fence, styled_cost
+from tab_marl.envs.styles import SLACK_NEEDED, STRENGTHS, Latents, Style, clearance_cost, fences_crossed, styled_cost
 from tab_marl.mission.automaton import COMPLETED, FAILED, UNBOUNDED, MissionAutomaton
 from tab_marl.mission.compile import compile_mission
 from tab_marl.mission.model import Mission
@@ -170,11 +170,11 @@ def _styled(plain: _Plain, latents: Latents) -> Parts:
     for strength in STRENGTHS:
         via = _via_points(rng, plain, latents.via_points, strength)
         places = {name: strength * metres for name, metres in dear.items()}
-        fenced = _fenced(plain, places) if latents.contrary_metres else None
+        crossed = _crossed(plain, places) if latents.contrary_metres else None
         route = solve_route(
             plain.automaton,
             grid,
-            styled_cost(scenario, grid, plain.clearance, latents, strength, fenced),
+            styled_cost(scenario, grid, plain.clearance, latents, strength, crossed),
             place_metres=places,
             via=via,
             via_location=home,
@@ -187,14 +187,14 @@ def _styled(plain: _Plain, latents: Latents) -> Parts:
     return plain.parts(latents, 0.0)
 
 
-def _fenced(plain: _Plain, place_metres: dict[str, float]) -> NDArray[np.bool_]:
-    """``[S]``: fences across the first leg of the shortest way to the places that come first if they cost so much more."""
+def _crossed(plain: _Plain, place_metres: dict[str, float]) -> NDArray[np.int64]:
+    """``[S, 16]``: fences across the first leg of the shortest way to the places chosen if they cost so much more."""
     grid, automaton = plain.route.grid, plain.automaton
     chosen = solve_route(automaton, grid, plain.clearance, place_metres=place_metres)
     cells, locations = chosen.path(plain.home, plain.scenario.adversary_start.centre)
     leg = grid.centres[cells[: int(np.argmax(locations != plain.home)) + 1]]
     failing = [region for region, fails in zip(automaton.regions, zones(automaton).T, strict=True) if fails.any()]
-    return fence(grid, [*plain.scenario.obstacles, *failing], leg)
+    return fences_crossed(grid, [*plain.scenario.obstacles, *failing], leg)
 
 
 def _via_points(

@@ -15,7 +15,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.mission.route_kernels import MOVE_X, MOVE_Y
+from tab_marl.mission.route_kernels import MOVE_CELLS, MOVE_X, MOVE_Y
 from tab_marl.world.grid import GridMap
 from tab_marl.world.regions import Region
 from tab_marl.world.scenario import STRICT, Scenario, UnknownName
@@ -29,8 +29,6 @@ STRENGTHS = (1.0, 0.5, 0.25)
 ZONE_MARGIN_METRES = 0.12
 ZONE_MARGIN_COST = 3.0
 WALL_SIDE_COST = 1.15
-FENCE_METRES = 0.3
-"""Width of the strip whose crossing costs a contrary adversary; moves are at most 0.23 m long."""
 NOISE_METRES = 0.5
 """Distance between the independent values of the random cost field."""
 WEIGHT_SLIP = 1e-3
@@ -216,23 +214,50 @@ def clearance_cost(grid: GridMap, zone_distance: NDArray[np.float64]) -> NDArray
     return np.where(zone_distance < ZONE_MARGIN_METRES, ZONE_MARGIN_COST, cost)
 
 
-def fence(grid: GridMap, regions: Sequence[Region], way: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """``[S]``: strips from the middle of each of these regions through the point of the way ``[K, 2]`` that is nearest to it.
+def fences_crossed(grid: GridMap, regions: Sequence[Region], way: NDArray[np.float64]) -> NDArray[np.int64]:
+    """``[S, 16]``: how many fences a move crosses.
 
-    The way crosses them all; one that passes a region on its other side does not cross that region's.
+    A fence stands from the middle of each region outwards, across the way ``[K, 2]`` where it passes nearest, to the wall
+    or region beyond. A way that passes the region on its other side does not cross it.
     """
-    across = np.zeros(grid.cells, dtype=bool)
+    crossed = np.zeros((grid.cells, 16), dtype=np.int64)
+    if len(way) < 2:
+        return crossed
+    moves = grid.cell_metres * MOVE_CELLS * np.stack([MOVE_X, MOVE_Y])
+    between = (way[1:] + way[:-1]) / 2
     for region in regions:
-        nearest = int(np.argmin(region.distance(way)))
+        nearest = between[int(np.argmin(region.distance(between)))]
         x_min, y_min, x_max, y_max = region.bounds()
         middle = np.array([(x_min + x_max) / 2, (y_min + y_max) / 2])
-        length = float(np.hypot(*(way[nearest] - middle)))
-        if length == 0.0 or nearest in (0, len(way) - 1):
-            continue  # the way does not go past it
-        (x, y), offset = (way[nearest] - middle) / length, grid.centres - middle
-        aside = np.abs(offset[:, 0] * y - offset[:, 1] * x)
-        across |= (offset @ (x, y) >= 0) & (aside <= FENCE_METRES / 2)
-    return across
+        length = float(np.hypot(*(nearest - middle)))
+        if length == 0.0:
+            continue
+        (x, y), offset = (nearest - middle) / length, grid.centres - middle
+        end = length + _open_metres(grid, regions, nearest, np.array([x, y]))
+        # Beside the fence (its two sides differ in sign) and along it, before the move and after it.
+        aside, along = offset @ (-y, x), offset @ (x, y)
+        aside_after, along_after = aside[:, None] + (-y, x) @ moves, along[:, None] + (x, y) @ moves
+        changes = (aside[:, None] >= 0) != (aside_after >= 0)
+        share = aside[:, None] / np.where(changes, aside[:, None] - aside_after, 1.0)
+        at = along[:, None] + share * (along_after - along[:, None])
+        crossed += changes & (at >= 0) & (at <= end)
+    return crossed
+
+
+def _open_metres(
+    grid: GridMap, regions: Sequence[Region], point: NDArray[np.float64], direction: NDArray[np.float64]
+) -> float:
+    """How far it is from the point, in this direction, to what is not free or lies in one of these regions."""
+    steps = grid.cell_metres / 2 * np.arange(1, 4 * max(grid.cell_at.shape))
+    points = point + steps[:, None] * direction
+    rows, columns = (np.floor(points[:, axis] / grid.cell_metres).astype(int) for axis in (1, 0))
+    height, width = grid.cell_at.shape
+    inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+    closed = ~inside
+    closed[inside] = grid.cell_at[rows[inside], columns[inside]] < 0
+    for region in regions:
+        closed |= region.contains(points)
+    return float(steps[int(np.argmax(closed))])
 
 
 def styled_cost(
@@ -241,12 +266,10 @@ def styled_cost(
     clearance: NDArray[np.float64],
     latents: Latents,
     strength: float,
-    fenced: NDArray[np.bool_] | None = None,
+    crossed: NDArray[np.int64] | None = None,
 ) -> NDArray[np.float64]:
-    """Costs ``[S, 16]`` of moves under these latents at this strength (0..1); `fenced` ``[S]``: see `fence`."""
+    """Costs ``[S, 16]`` of moves under these latents at this strength (0..1); `crossed` ``[S, 16]``: see `fences_crossed`."""
     cells = clearance.copy()
-    if fenced is not None:
-        cells = cells * np.where(fenced, 1.0 + strength * latents.contrary_metres / FENCE_METRES, 1.0)
     if latents.camera_shy:
         cells = cells * np.where(scenario.seen(grid.centres), 1.0 + strength * latents.camera_shy, 1.0)
     if latents.edge_noise:
@@ -257,6 +280,8 @@ def styled_cost(
         arm /= np.maximum(np.hypot(arm[:, 0], arm[:, 1]), 1e-9)[:, None]
         turning = arm[:, :1] * MOVE_Y - arm[:, 1:] * MOVE_X
         edges *= 1.0 + strength * latents.side_cost * np.maximum(0.0, -latents.side * turning)
+    if crossed is not None:
+        edges += strength * latents.contrary_metres * crossed / (grid.cell_metres * MOVE_CELLS)
     return np.asarray(edges)
 
 

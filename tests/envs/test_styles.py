@@ -9,7 +9,9 @@ import pytest
 
 from tab_marl.envs.adversary_observation import AdversaryTask
 from tab_marl.envs.styles import STYLES, Style
+from tab_marl.mission.parse import parse_mission
 from tab_marl.mission.tasks import sample_task
+from tab_marl.world.regions import Box, Disc
 from tab_marl.world.scenario import UnknownName
 
 
@@ -75,6 +77,35 @@ def test_camera_shy_ways_spend_fewer_cells_under_cameras():
         for name, route in (("styled", task.parts.styled), ("plain", task.parts.plain)):
             under[name] += int(task.scenario.seen(start_path(task, route)).sum())
     assert under["styled"] < 0.75 * under["plain"]
+
+
+def test_contrary_goes_round_the_other_side_if_that_costs_no_more_than_it_is_willing_to_pay():
+    """A box between start and goal, its middle below the line between them: below is about 0.7 m longer than above."""
+    task = sample_task(np.random.default_rng(0), "M1", "point", 2.0)
+    goal = task.scenario.checkpoints[0]
+    scenario = replace(
+        task.scenario,
+        checkpoints=(replace(goal, x=2.6, y=1.5), *task.scenario.checkpoints[1:]),
+        obstacles=(Box(1.3, 0.7, 1.7, 1.7),),
+        adversary_start=Disc(0.4, 1.5, 0.1),
+    )
+    mission = parse_mission(f"Reach {goal.name} within 50 s", scenario)
+
+    def way(metres):
+        task = AdversaryTask.build(scenario, mission, Style(contrary_metres=metres), np.random.default_rng(0))
+        return start_path(task, task.parts.styled)
+
+    def metres_of(path):
+        return np.hypot(*np.diff(path, axis=0).T).sum()
+
+    above, below = way(0.0), way(3.0)
+    between = {name: path[np.abs(path[:, 0] - 1.5) < 0.15, 1] for name, path in (("above", above), ("below", below))}
+    assert (between["above"] > 1.7).all() and (between["below"] < 0.7).all()
+    detour = metres_of(below) - metres_of(above)
+    assert 0.4 < detour < 1.2
+    for metres in (0.4 * detour, 0.8 * detour, 1.25 * detour, 2.0 * detour):
+        goes_below = way(metres)[:, 1].min() < 0.7
+        assert goes_below == (metres > detour), (metres, detour)
 
 
 def test_wander_takes_another_way_each_time_and_fickle_another_goal():
