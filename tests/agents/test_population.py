@@ -38,7 +38,7 @@ from tab_marl.agents.training.algorithms import ALGORITHMS
 from tab_marl.agents.training.log import LearningCurve, read_log
 from tab_marl.agents.training.settings import TrainingError, TrainingSettings
 from tab_marl.agents.training.train import train
-from tab_marl.envs.styles import STYLES
+from tab_marl.envs.styles import STYLES, Style
 from tab_marl.evaluation.train_command import clock, train_many
 
 TINY = """
@@ -71,7 +71,7 @@ style = "side"
 hyperparameters = { gamma = 0.9 }
 
 [[member]]
-style = ["late", "fickle"]
+style = ["late", { name = "keen", camera_shy = 2.0 }]
 split = "final"
 
 [[member]]
@@ -81,15 +81,13 @@ seeds = [3, 5]
 """,
     )
     population = Population.load(path)
-    assert [m.name for m in population.members] == ["side", "late-fickle", "shy-3", "shy-5"]
+    assert [m.name for m in population.members] == ["side", "late-keen", "shy-3", "shy-5"]
     side, mixed, three, five = population.members
     assert (
         side.style == STYLES["side"] and side.hyperparameters["gamma"] == 0.9 and side.hyperparameters["n_steps"] == 10
     )
-    assert [habit.style for habit in mixed.style.mixture] == [
-        STYLES["late"],
-        STYLES["fickle"],
-    ] and mixed.split == "final"
+    assert [habit.style for habit in mixed.style.mixture] == [STYLES["late"], Style("keen", camera_shy=2.0)]
+    assert mixed.split == "final"
     assert (three.seed, five.seed) == (3, 5) and three.style.camera_shy == 2.0
     assert all(m.steps == 800 for m in population.members)
     assert population.only(["side"]).members == (side,)
@@ -109,6 +107,8 @@ seeds = [3, 5]
         ("[[member]]\nseed = 1\nseeds = [2]", "give seed or seeds, not both"),
         ("[[member]]\nstyle = ['late']", "must name two or more styles"),
         ("[[member]]\nstyle = ['late', 'latte']", "did you mean 'late'"),
+        ("[[member]]\nstyle = ['late', ['side']]", "style"),
+        ("[[member]]\nstyle = ['late', { name = 'x', side = 2.0 }]", "Style.side is 2.0, must be a probability"),
         ("[[member]]\nsplit = 'test'", "split"),
         ("[[member]]\nalgorithm = 'dqn'", "algorithm"),
         ("[[member]]\n[member.map]\ncheckpoints = 0", "map.*checkpoints is 0"),
