@@ -21,10 +21,17 @@ GROUPS = (*SPLITS, ALL)
 """Stand for the shipped policies of a split, or of both."""
 
 
-@lru_cache(maxsize=64)
 def opponent(name: str) -> AdversaryPolicy:
-    """A policy of the zoo by name, `scripted`, or the policy in a folder. Raises UnknownName or PolicyError."""
-    return ScriptedAdversary() if name == SCRIPTED else find_policy(name)
+    """A policy of the zoo by name, `scripted`, or the policy in a folder. Raises UnknownName or PolicyError.
+
+    Every call gives one with a memory of its own: a planner rolls out the very policy that it plays against.
+    """
+    return ScriptedAdversary() if name == SCRIPTED else _found(name).another()
+
+
+@lru_cache(maxsize=64)
+def _found(name: str) -> ZooPolicy:
+    return find_policy(name)
 
 
 @lru_cache(maxsize=4)

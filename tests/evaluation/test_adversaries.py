@@ -7,7 +7,7 @@ import shutil
 import numpy as np
 import pytest
 
-from tab_marl.agents.policies.zoo import SHIPPED, ZOO_VARIABLE, find_policy, load_zoo
+from tab_marl.agents.policies.zoo import SHIPPED, ZOO_VARIABLE, find_policy, load_policy, load_zoo
 from tab_marl.evaluation.adversaries import opponent, population, resolve_opponents, zoo_names
 from tab_marl.evaluation.errors import UserError
 from tab_marl.evaluation.evaluate import prepare
@@ -76,3 +76,14 @@ def test_population_pomcp_knows_the_policies_that_are_played():
     alone, _ = population(names[:1])(task, np.random.default_rng(0))
     np.testing.assert_array_equal(positions[:30], alone)
     assert {p.name for p in load_zoo()} > set(names)
+
+
+def test_every_caller_has_a_recurrent_policy_with_a_memory_of_its_own() -> None:
+    """population-POMCP rolls out the policy that it plays against, many episodes at a time, in the middle of an episode."""
+    playing, alone = opponent("fickle-lstm"), load_policy(SHIPPED / "fickle-lstm")
+    task = sample_task(np.random.default_rng(3), "M1", "ambiguous")
+    observations = np.random.default_rng(4).uniform(-1, 1, (6, playing.actor.network.layers[0])).astype(np.float32)
+    for step, observation in enumerate(observations):
+        if step == 3:
+            population(["fickle-lstm"])(task, np.random.default_rng(5))
+        np.testing.assert_array_equal(playing.act(observation), alone.act(observation))
