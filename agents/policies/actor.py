@@ -118,8 +118,7 @@ class Actor:
     def bounded(self, out: Array) -> Array:
         """The action that an output of the last layer, with or without noise, stands for."""
         if out.shape[-1] == len(TABLE):
-            shares = _TABLE[np.argmax(out, axis=-1)]
-            return np.asarray(shares)
+            return np.take(_TABLE, np.argmax(out, axis=-1), axis=0)  # a copy, which the caller may write to
         if self.network.squashed:
             return np.tanh(out)
         return np.minimum(np.maximum(out, np.float32(-1.0)), np.float32(1.0))

@@ -118,6 +118,19 @@ def test_a_governor_keeps_the_missions_speed_limit_and_nothing_else() -> None:
         assert (action[:, 0] < free[:, 0]).any()
 
 
+def test_a_governor_leaves_the_table_of_discrete_actions_as_it_was() -> None:
+    """One observation at a time, as the environment asks: an action must not be a row of the table itself."""
+    learner = PPO("MlpPolicy", adversary_env(actions="discrete"), device="cpu", seed=3)
+    policy = policy_of(learner, settings("x"), 0)
+    seen = observations(20)
+    before = [policy.act(o).copy() for o in seen]
+    governed = seen.copy()
+    governed[:, O_LIMIT] = 0.1
+    assert max(policy.act(o)[0] for o in governed) <= 2 * 0.1 - 1
+    np.testing.assert_array_equal([policy.act(o) for o in seen], before)
+    assert max(action[0] for action in before) > 2 * 0.1 - 1
+
+
 def test_a_recurrent_policy_remembers_its_episode_and_nothing_of_the_last_one() -> None:
     policy = policy_of(model("ppo_lstm"), settings("x"), 0)
     first = [policy.act(o) for o in observations(4)]
