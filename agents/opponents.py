@@ -53,6 +53,10 @@ class SavedModel:
         """Of the episodes played side by side, these begin anew."""
         self.memory.begin(which)
 
+    def another(self) -> SavedModel:
+        """The same actor with a memory of its own."""
+        return SavedModel(self.name, self.actor)
+
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Action ``[2]`` (``[N, 2]``) in [-1, 1] for an observation ``[D]`` (``[N, D]``).
 

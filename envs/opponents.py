@@ -225,8 +225,9 @@ def make_opponent(opponent: Opponent | Any, side: str, adversaries: int = 1) -> 
     """The player of a side, in an arena with so many adversaries.
 
     `opponent`: a scripted player's name, another name for the registered loader, an object with `act(observation)`, a
-    stable-baselines3 model, or a function of the observation. Raises UnknownName for a name that nobody knows, TypeError for
-    what cannot act.
+    stable-baselines3 model, or a function of the observation. Of a policy that may remember its episode (it has `another`) the
+    player is another one, with a memory of its own. Raises UnknownName for a name that nobody knows, TypeError for what cannot
+    act.
     """
     if isinstance(opponent, str):
         if opponent == "pursue" and side == "ego":
@@ -240,7 +241,8 @@ def make_opponent(opponent: Opponent | Any, side: str, adversaries: int = 1) -> 
         loaded: Player = getattr(import_module(module), function)(opponent, side)
         return loaded
     if isinstance(opponent, Player):
-        return opponent
+        another: Callable[[], Player] | None = getattr(opponent, "another", None)
+        return opponent if another is None else another()
     if hasattr(opponent, "predict"):
         return Model(opponent)
     if callable(opponent):

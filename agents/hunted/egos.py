@@ -50,8 +50,8 @@ class Hunters:
             raise ValueError("there must be at least one ego that hunts, got none")
         self.names = tuple(names)
         self._options = options or hunting_options()
-        self._shared = {name: make_opponent(name, "ego") for name in names if name.endswith(".zip")}
-        """Saved models remember nothing, so one plays in all arenas."""
+        self._saved = {name: make_opponent(name, "ego") for name in names if name.endswith(".zip")}
+        """Saved models, read once; every arena has another of them, since a recurrent one remembers its episode."""
         self._own: list[dict[str, Any]] = [{} for _ in range(arenas)]
         self._playing: list[Any] = [None] * arenas
 
@@ -61,9 +61,10 @@ class Hunters:
         Returns what it has learned in earlier episodes, as JSON text ("" for nothing); `learned` puts that back first.
         """
         name = self.names[hunter]
-        player = self._shared.get(name) or self._own[arena].get(name)
+        player = self._own[arena].get(name)
         if player is None:
-            player = make_planner(name, self._options) if name in PLANNERS else make_opponent(name, "ego")
+            known_by = self._saved.get(name, name)
+            player = make_planner(name, self._options) if name in PLANNERS else make_opponent(known_by, "ego")
             self._own[arena][name] = player
         if learned and isinstance(player, PlannerAgent):
             player.restore(json.loads(learned))

@@ -15,6 +15,7 @@ from sb3_contrib import TQC, RecurrentPPO
 from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 
 import tab_marl  # noqa: F401, registers the environments
+from tab_marl.agents.hunted.egos import Hunters
 from tab_marl.agents.opponents import load_model
 from tab_marl.agents.policies.actor import Actor, ActorError, Memory, Network
 from tab_marl.agents.policies.sb3_actors import actor_of_model, normalised, read_zip
@@ -23,7 +24,8 @@ from tab_marl.agents.training.settings import TrainingSettings
 from tab_marl.envs.adversary_kernels import O_LIMIT
 from tab_marl.envs.adversary_observation import OBSERVED, observation_bounds
 from tab_marl.envs.batched_env import batched_adversary_env, batched_ego_env
-from tab_marl.envs.single_agent import adversary_env
+from tab_marl.envs.single_agent import adversary_env, ego_env
+from tab_marl.mission.tasks import sample_task
 
 OFF = {"buffer_size": 10}
 MODELS: dict[str, tuple[type, str, dict[str, Any]]] = {
@@ -143,6 +145,34 @@ def test_a_recurrent_policy_remembers_its_episode_and_nothing_of_the_last_one() 
     np.testing.assert_array_equal(other.act(observations(4)[0]), first[0])
 
 
+def test_environments_that_are_given_one_recurrent_policy_do_not_share_its_memory(tmp_path: Path) -> None:
+    """Two in turn, as in a vector of environments, act as each does alone; so do the egos of the hunted arenas."""
+    policy = policy_of(model("ppo_lstm"), settings("x"), 0)
+    still = np.array([-1.0, 0.0], dtype=np.float32)
+
+    def seen(envs: list[gymnasium.Env[Any, Any]]) -> list[np.ndarray]:
+        for i, env in enumerate(envs):
+            env.reset(seed=i)
+        for _ in range(8):
+            for env in envs:
+                env.step(still)
+        return [env.inner.state() for env in envs]  # type: ignore[attr-defined]
+
+    together = seen([ego_env(policy, max_cycles=20) for _ in range(2)])
+    np.testing.assert_array_equal(together[0], seen([ego_env(policy, max_cycles=20)])[0])
+    learner = RecurrentPPO("MlpLstmPolicy", ego_env(), device="cpu", seed=3, policy_kwargs={"lstm_hidden_size": 6})
+    learner.save(tmp_path / "ego.zip")
+    task = sample_task(np.random.default_rng(0), "M1")
+    given = np.random.default_rng(1).uniform(-1, 1, (5, 2, 27)).astype(np.float32)
+    hunters, alone = Hunters([str(tmp_path / "ego.zip")], 2), load_model(tmp_path / "ego.zip")
+    for arena in (0, 1):
+        hunters.begin(arena, 0, task, 0)
+    for both in given:
+        np.testing.assert_array_equal(hunters.act(both)[1], alone.act(both[1]))
+    hunters.begin(0, 0, task, 0)
+    np.testing.assert_array_equal(hunters.act(given[0])[1], alone.act(given[0][1]))
+
+
 def test_rows_that_begin_anew_forget_and_the_others_do_not() -> None:
     """As stable-baselines3's `episode_start` says it."""
     policy = policy_of(model("ppo_lstm"), settings("x"), 0)
@@ -158,6 +188,7 @@ def test_batched_arenas_tell_a_recurrent_player_which_episodes_begin() -> None:
     """Arenas that end at different times act as each would alone: a player that never forgets drives elsewhere."""
     policy = policy_of(model("ppo_lstm"), settings("x"), 0)
     env = batched_ego_env(3, policy, max_cycles=9)
+    policy = env._crowd._player  # type: ignore[attr-defined]
     env.reset(seed=1)
     still = np.tile(np.array([-1.0, 0.0], dtype=np.float32), (3, 1))
     for _ in range(9):
