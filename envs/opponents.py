@@ -203,13 +203,32 @@ class Function:
 
 
 class Model:
-    """A stable-baselines3 model, or whatever else has `predict(observation) -> (action, state)`, as a player."""
+    """A stable-baselines3 model, or whatever else has `predict(observation) -> (action, state)`, as a player.
+
+    A state other than None, as recurrent models have, is handed back with the next observation.
+    """
 
     def __init__(self, model: Any) -> None:
         self._model = model
+        self._state: Any = None
+        self._begun: set[int] = set()
+
+    def reset(self, task: Task, rng: np.random.Generator) -> None:
+        """Begin an episode."""
+        self._state = None
+
+    def begin(self, which: NDArray[np.int64]) -> None:
+        """Of the episodes played side by side, these begin anew."""
+        self._begun.update(which.tolist())
 
     def act(self, observation: NDArray[np.float32]) -> Action:
-        return np.asarray(self._model.predict(observation, deterministic=True)[0], dtype=np.float32)
+        remembered: dict[str, Any] = {}
+        if self._state is not None:
+            starts = np.isin(np.arange(len(np.atleast_2d(observation))), list(self._begun))
+            remembered = {"state": self._state, "episode_start": starts}
+        self._begun.clear()
+        action, self._state = self._model.predict(observation, deterministic=True, **remembered)
+        return np.asarray(action, dtype=np.float32)
 
 
 OPPONENTS: dict[str, dict[str, Callable[[], Player]]] = {

@@ -24,6 +24,7 @@ from tab_marl.agents.training.settings import TrainingSettings
 from tab_marl.envs.adversary_kernels import O_LIMIT
 from tab_marl.envs.adversary_observation import OBSERVED, observation_bounds
 from tab_marl.envs.batched_env import batched_adversary_env, batched_ego_env
+from tab_marl.envs.opponents import Model
 from tab_marl.envs.single_agent import adversary_env, ego_env
 from tab_marl.mission.tasks import sample_task
 
@@ -143,6 +144,21 @@ def test_a_recurrent_policy_remembers_its_episode_and_nothing_of_the_last_one() 
         policy.act(observations(3))
     other = policy.another()
     np.testing.assert_array_equal(other.act(observations(4)[0]), first[0])
+
+
+def test_a_live_recurrent_model_remembers_its_episodes_as_its_policy_does() -> None:
+    policy, player = policy_of(model("ppo_lstm"), settings("x"), 0), Model(model("ppo_lstm"))
+    for _ in range(2):
+        policy.reset(None, None)  # type: ignore[arg-type]
+        player.reset(None, None)  # type: ignore[arg-type]
+        for observation in observations(4):
+            np.testing.assert_allclose(player.act(observation), policy.act(observation), atol=1e-5)
+    policy, player = policy.another(), Model(model("ppo_lstm"))
+    for step, batch in enumerate(observations(6, 5)):
+        begun = np.flatnonzero([step == 0, step == 2, step == 0, step in (2, 4), False])
+        policy.begin(begun)
+        player.begin(begun)
+        np.testing.assert_allclose(player.act(batch), policy.act(batch), atol=1e-5)
 
 
 def test_environments_that_are_given_one_recurrent_policy_do_not_share_its_memory(tmp_path: Path) -> None:
