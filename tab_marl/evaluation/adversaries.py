@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Sequence
 from functools import lru_cache
@@ -49,6 +50,12 @@ def population(names: Sequence[str]) -> Rollouts:
     return rollouts
 
 
+def digest(policy: ZooPolicy) -> str:
+    """Of what decides how a policy plays: its weights, and what its card says of the network and of the routes it is shown."""
+    said = policy.card.model_dump_json(include={"name", "sha256", "network", "style"})
+    return hashlib.blake2b(said.encode(), digest_size=8).hexdigest()
+
+
 def resolve_opponents(asked: Sequence[str], mix_splits: bool = False) -> dict[str, str]:
     """What to call each opponent in a job -> digest of what it is; the shipped policies of the final split if none is asked.
 
@@ -60,20 +67,20 @@ def resolve_opponents(asked: Sequence[str], mix_splits: bool = False) -> dict[st
     found: dict[str, str] = {}
     splits: dict[Split, list[str]] = {"development": [], "final": []}
 
-    def take(name: str, digest: str, policy: ZooPolicy) -> None:
+    def take(name: str, known_by: str, policy: ZooPolicy) -> None:
         if name not in found:
             splits[policy.split].append(policy.name)
-        found[name] = digest
+        found[name] = known_by
 
     for name in asked or ("final",):
         if os.sep in name:
             policy = load_policy(name)
-            take(str(Path(name).resolve()), policy.card.sha256[:16], policy)
+            take(str(Path(name).resolve()), digest(policy), policy)
             continue
         known = {policy.name: (policy, path) for policy, path in all_policies()}
         if Path(name).is_dir() and name not in known and name not in GROUPS:
             policy = load_policy(name)
-            take(str(Path(name).resolve()), policy.card.sha256[:16], policy)
+            take(str(Path(name).resolve()), digest(policy), policy)
             continue
         (right,) = require_known("adversary", (name,), (*known, SCRIPTED, *GROUPS))
         if right == SCRIPTED:
@@ -89,7 +96,7 @@ def resolve_opponents(asked: Sequence[str], mix_splits: bool = False) -> dict[st
             if path.parent == SHIPPED:
                 take(right, "", policy)
             else:
-                take(str(path.resolve()), policy.card.sha256[:16], policy)
+                take(str(path.resolve()), digest(policy), policy)
     if all(splits.values()) and not mix_splits:
         raise UserError(
             f"the adversaries mix policies for development ({', '.join(splits['development'])}) and for the final table "

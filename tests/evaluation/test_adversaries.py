@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 
 import numpy as np
 import pytest
 
 from tab_marl.agents.policies.zoo import SHIPPED, ZOO_VARIABLE, find_policy, load_policy, load_zoo
-from tab_marl.evaluation.adversaries import opponent, population, resolve_opponents, zoo_names
+from tab_marl.evaluation.adversaries import digest, opponent, population, resolve_opponents, zoo_names
 from tab_marl.evaluation.errors import UserError
 from tab_marl.evaluation.evaluate import prepare
 from tab_marl.evaluation.settings import EvaluationSettings
@@ -61,10 +62,21 @@ def test_splits_are_not_mixed_silently():
 def test_a_users_policies_go_by_name_and_count_in_the_key(own):
     found = resolve_opponents(("my-final", "final"))
     assert list(found) == [str(own / "my-final"), *zoo_names("final")]
-    assert found[str(own / "my-final")] == find_policy("my-final").card.sha256[:16]
+    assert found[str(own / "my-final")] == digest(find_policy("my-final"))
     assert "my-final" not in resolve_opponents(()), "a table's adversaries do not change with a user's folder"
     with pytest.raises(UserError, match=r"for development \(my-dev\)"):
         resolve_opponents(("my-dev", "final"))
+
+
+def test_rows_of_a_users_policy_in_another_style_do_not_mix(own):
+    """The same weights that are shown other routes are another adversary; what was measured of it is not."""
+    card = own / "my-final" / "card.json"
+    settings = EvaluationSettings(adversaries=("my-final",))
+    before, written = prepare(settings).key, json.loads(card.read_text())
+    card.write_text(json.dumps({**written, "description": "mine", "success": []}))
+    assert prepare(settings).key == before
+    card.write_text(json.dumps({**written, "style": {**written["style"], "side": 0.5}}))
+    assert prepare(settings).key != before
 
 
 def test_population_pomcp_knows_the_policies_that_are_played():
