@@ -213,7 +213,7 @@ def play_unit(job: Job, trace: bool = False) -> list[Played]:
             if job.learned is not None:
                 planner.restore(json.loads(job.learned))
             policy = opponent(job.adversary)
-            _warm(name, task, policy)
+            _warm(name, task, options, policy, episode_seed, planner_seed)
             played.append(run_episode(task, planner, policy, episode_seed, trace, job.unit.seed, planner_seed))
         except (Interrupted, MemoryError):
             raise
@@ -225,11 +225,17 @@ def play_unit(job: Job, trace: bool = False) -> list[Played]:
 _warmed: set[str] = set()
 
 
-def _warm(planner: str, task: Task, policy: AdversaryPolicy) -> None:
-    """Play the first moments of a throw-away episode, once per process: loading compiled kernels is no decision time."""
+def _warm(
+    planner: str, task: Task, options: PlannerOptions, policy: AdversaryPolicy, seed: int, planner_seed: int
+) -> None:
+    """Play the first moments of the episode, once per process: loading compiled kernels is no decision time.
+
+    Those of another episode could break down where this one does not, and which episode is a worker's first is chance.
+    """
     if planner not in _warmed:
         _warmed.add(planner)
-        run_episode(task, make_planner(planner), policy, seed=0, max_steps=WARM_STEPS)
+        agent = make_planner(planner, options)
+        run_episode(task, agent, policy, seed, planner_seed=planner_seed, max_steps=WARM_STEPS)
 
 
 def _broken(job: Job, planner: str, task: Task | None, error: Exception, seconds: float) -> Played:

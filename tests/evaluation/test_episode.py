@@ -136,6 +136,34 @@ def test_an_episode_that_breaks_down_is_a_row(monkeypatch):
     assert good.row.error is None
 
 
+def test_a_workers_first_episode_is_the_row_that_any_other_would_be(monkeypatch):
+    """It is warmed up with its own first moments: other options or another seed may break down where it does not."""
+
+    def planner(name, options=None):
+        if options is None:
+            raise RuntimeError("other options")
+        return make_planner(name, options)
+
+    def env(**arguments):
+        made = parallel_env(**arguments)
+        reset = made.reset
+
+        def reset_unless_0(seed):
+            if seed == 0:
+                raise RuntimeError("another seed")
+            return reset(seed=seed)
+
+        made.reset = reset_unless_0
+        return made
+
+    (usual,) = play_unit(job())
+    monkeypatch.setattr(episode, "make_planner", planner)
+    monkeypatch.setattr(episode, "parallel_env", env)
+    monkeypatch.setattr(episode, "_warmed", set())
+    (first,) = play_unit(job())
+    assert first.row == usual.row and first.row.error is None
+
+
 def test_a_task_that_cannot_be_drawn_is_a_row(monkeypatch):
     def nothing(*_):
         raise RuntimeError("no winnable task")
