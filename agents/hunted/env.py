@@ -205,5 +205,6 @@ class HuntedVecEnv(TrainingEnv):
                 actions[begun] = self._told[begun, now - (last - steps[begun])]
                 self._play(actions)
         self.weights = arrays["weights"].copy()
-        self.recent, self.recently_caught = text["recent"], text["caught"]
+        self.recent = {kind: list(shares) for kind, shares in text["recent"].items()}
+        self.recently_caught = list(text["caught"])
         self.rng.bit_generator.state = text["random"]

@@ -106,11 +106,14 @@ def test_same_seed_same_episodes_and_a_kill_changes_nothing(
     arrays, text = one.snapshot()
     fresh = make(5)
     fresh.restore(arrays, text)
+    assert fresh.recently_caught is not one.recently_caught
+    assert all(fresh.recent[kind] is not one.recent[kind] for kind in one.recent)
     assert np.array_equal(fresh.observation, one.observation)
     late, resumed = play(one, 40), play(fresh, 40)
     assert all(np.array_equal(a, b) for a, b in zip(late, resumed, strict=True))
     assert fresh.snapshot()[1]["random"] == one.snapshot()[1]["random"]
     np.testing.assert_equal(fresh.success(), one.success())
+    assert fresh.recently_caught == one.recently_caught
 
 
 @pytest.mark.parametrize("name", ["FP-POMCP", "TAB-POMCP"])
