@@ -138,7 +138,8 @@ def export(
     with Store.open(out) as store:
         stored = _stored(store, out, key, notes_console())
         path = to or store.path.parent / f"episodes.{kind}"
-        print(f"{write(store, stored.key, kind, path)} episodes: {path}")
+        count, checksum = write(store, stored.key, kind, path)
+        print(f"{count} episodes: {path}\nsha256 of what settings and seeds decide: {checksum}")
 
 
 def _stored(store: Store, out: Path, key: str | None, notes: Console) -> StoredSettings:

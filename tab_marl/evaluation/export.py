@@ -1,11 +1,12 @@
-"""Stored rows as one file for other programs: CSV, or Parquet with pyarrow."""
+"""Stored rows as one file for other programs: CSV (also compressed), or Parquet with pyarrow; and their checksum."""
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pandas as pd
 
@@ -19,6 +20,8 @@ MEASURED = (
     "preparation_processor_seconds", "decision_processor_seconds", "planner_processor_seconds",
     "simulation_processor_seconds",
 )  # fmt: skip
+TYPES = {"completed_step": "Int64", "error": "string"}
+COMPRESSIONS: dict[str, Literal["gzip", "xz"]] = {".gz": "gzip", ".xz": "xz"}
 
 
 def frame(rows: list[EpisodeRow], timings: dict[tuple[str, str, str, int], Timing], key: str) -> pd.DataFrame:
@@ -50,12 +53,25 @@ def frame(rows: list[EpisodeRow], timings: dict[tuple[str, str, str, int], Timin
                 **{name: None if timing is None else getattr(timing, name) for name in MEASURED},
             }
         )
-    found = pd.DataFrame(table)
-    return found.astype({"completed_step": "Int64", "decisions": "Int64", "error": "string"})
+    return pd.DataFrame(table).astype({**TYPES, "decisions": "Int64"})
 
 
-def export(store: Store, key: str, kind: str, path: Path) -> int:
-    """Write the rows under a settings key; returns how many. Raises UserError: format, pyarrow missing, no rows, disk."""
+def checksum(table: pd.DataFrame) -> str:
+    """SHA-256 of what settings and seeds decide: the same for the same rows, whatever machine played them and how long it took.
+
+    `table`: of `frame`, or an exported file. The settings' key is not in it: code that changed and plays the same episodes has
+    the same checksum. Numbers count to twelve digits, as parsers of CSV differ in the last.
+    """
+    decided = table.drop(columns=["settings", *MEASURED]).astype(TYPES)
+    decided = decided.sort_values(["mission", "family", "planner", "seed"], kind="stable")
+    return hashlib.sha256(decided.to_csv(index=False, lineterminator="\n", float_format="%.12g").encode()).hexdigest()
+
+
+def export(store: Store, key: str, kind: str, path: Path) -> tuple[int, str]:
+    """Write the rows under a settings key; returns how many, and their checksum.
+
+    A CSV file whose name ends in .gz or .xz is compressed. Raises UserError: format, pyarrow missing, no rows, disk.
+    """
     check_format(kind)
     rows = store.rows(key)
     if not rows:
@@ -65,13 +81,13 @@ def export(store: Store, key: str, kind: str, path: Path) -> int:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if kind == "csv":
-            table.to_csv(partial, index=False)
+            table.to_csv(partial, index=False, lineterminator="\n", compression=COMPRESSIONS.get(path.suffix))
         else:
             table.to_parquet(partial, index=False, engine="pyarrow")
         os.replace(partial, path)
     except OSError as error:
         raise UserError(f"{path}: cannot be written: {error.strerror or error}") from None
-    return len(table)
+    return len(table), checksum(table)
 
 
 def check_format(kind: str) -> None:

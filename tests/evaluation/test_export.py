@@ -31,7 +31,7 @@ def store(tmp_path, synthetic):
 @pytest.mark.parametrize("kind", export.FORMATS)
 def test_both_formats_hold_every_column(store, tmp_path, kind):
     path = tmp_path / "deep" / f"rows.{kind}"
-    assert export.export(store, "abc", kind, path) == 2
+    assert export.export(store, "abc", kind, path)[0] == 2
     back = pd.read_csv(path) if kind == "csv" else pd.read_parquet(path)
     assert list(back["planner"]) == ["S-POMCP", "TAB-POMCP"], "sorted by key"
     fields = set(EpisodeRow.__dataclass_fields__) - {"learned"}
@@ -48,6 +48,17 @@ def test_the_same_rows_make_the_same_file(store, tmp_path):
     for name in ("a", "b"):
         export.export(store, "abc", "csv", tmp_path / name)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_the_checksum_is_of_what_was_decided_and_can_be_had_from_the_file(store, tmp_path, synthetic):
+    path = tmp_path / "rows.csv.xz"
+    count, checksum = export.export(store, "abc", "csv", path)
+    assert path.read_bytes()[:6] == b"\xfd7zXZ\x00" and count == 2
+    back = pd.read_csv(path)
+    assert export.checksum(back) == export.checksum(back.sample(frac=1.0, random_state=1)) == checksum
+    slower = back.assign(seconds=1e9, decisions=1, settings="other")
+    assert export.checksum(slower) == checksum
+    assert export.checksum(back.assign(physics_steps=back["physics_steps"] + [0, 1])) != checksum
 
 
 def test_refusals(store, tmp_path, monkeypatch):
@@ -69,4 +80,6 @@ def test_command(store, tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit, match="0"):
         main()
     path = store.path.parent / "episodes.csv"
-    assert capsys.readouterr().out == f"2 episodes: {path}\n" and len(pd.read_csv(path)) == 2
+    said = capsys.readouterr().out.splitlines()
+    assert said[0] == f"2 episodes: {path}" and len(pd.read_csv(path)) == 2
+    assert said[1] == f"sha256 of what settings and seeds decide: {export.checksum(pd.read_csv(path))}"
