@@ -233,9 +233,15 @@ def watch(
 @app.command()
 def train(
     population: Annotated[
-        Path | None, typer.Argument(help='TOML file of a population, or "shipped"; without it one policy is trained.')
+        Path | None,
+        typer.Argument(
+            help="TOML file of a population, or one of ours: shipped, algorithms; without it one policy is trained."
+        ),
     ] = None,
-    style: Annotated[str | None, typer.Option(help="Of one policy: a style by name: direct, ...")] = None,
+    style: Annotated[
+        str | None,
+        typer.Option(help="Of one policy: direct, side, via, camera-shy, late, wander, fickle, contrary, habits."),
+    ] = None,
     algorithm: Annotated[str | None, typer.Option(help="Of one policy: ppo, a2c, sac, td3, tqc, ppo_lstm.")] = None,
     config: Annotated[Path | None, typer.Option(help="Of one policy: TOML file with training settings.")] = None,
     steps: Annotated[int | None, typer.Option(help="Control steps over all robots.")] = None,
