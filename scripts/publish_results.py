@@ -1,0 +1,81 @@
+"""Keep a run as the project's published result: ``python scripts/publish_results.py --out runs/paper``.
+
+Writes the rows (compressed CSV) and figures into docs/results, and fills the tables between the marks of docs/results/README.md and
+of the README. What the tables mean is written there by hand.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import tab_marl
+from tab_marl.evaluation import decision_times
+from tab_marl.evaluation.export import export
+from tab_marl.evaluation.population_study import put_tables
+from tab_marl.evaluation.provenance import describe_runs
+from tab_marl.evaluation.report import exports, plots
+from tab_marl.evaluation.report.present import describe_adversaries
+from tab_marl.evaluation.report.results import ReportData, Results, compute
+from tab_marl.evaluation.settings import HEADLINE, PLANNERS
+from tab_marl.evaluation.store import Store, StoredSettings
+from tab_marl.evaluation.tables import ALL
+
+ROWS = "episodes.csv.xz"
+RECORDED = ("started", "ended", "episodes", "engine", "machine", "commit", "code", "versions", "zoo")
+
+
+def main(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the run.")] = Path("runs/paper"),
+    docs: Annotated[Path, typer.Option(help="Folder of the pages.")] = Path("docs"),
+    readme: Annotated[Path, typer.Option(help="The page with the short table.")] = Path("README.md"),
+) -> None:
+    """Write rows, figures and tables of the latest settings that were played there."""
+    folder = docs / "results"
+    with Store.open(out) as store:
+        stored = next(s for s in store.settings() if s.rows)
+        rows, timings = store.rows(stored.key), store.timings(stored.key)
+        count, checksum = export(store, stored.key, "csv", folder / ROWS)
+        runs = [{key: run[key] for key in RECORDED} for run in describe_runs(store.runs(stored.key))]
+    cards = describe_adversaries(stored.content["adversaries"])
+    results = compute(ReportData(rows, timings, stored.content, stored.key, (), None, cards, tab_marl.__version__, {}))
+    plots.export_figures(results, folder, ["svg"])
+    found = {table.name: exports.markdown(table).strip() for table in exports.all_tables(results)}
+    found["summary"] = summary(results)
+    found["record"] = record(stored, runs, count, checksum)
+    found["time"] = "```text\n" + "\n".join(decision_times.summary(timings)) + "\n```"
+    for path in (folder / "README.md", readme):
+        text = path.read_text(encoding="utf-8")
+        marked = {name: table for name, table in found.items() if f"<!-- begin {name} -->" in text}
+        path.write_text(put_tables(text, marked), encoding="utf-8")
+        print(f"{path}: {', '.join(marked)}")
+
+
+def summary(results: Results) -> str:
+    """All missions together: a line per family and measure, a column per planner."""
+    lines = {(x.family, x.planner): x for x in results.lines if x.mission == ALL}
+    planners = [p for p in PLANNERS if any(planner == p for _, planner in lines)]
+    names = [f"**{p.removesuffix('-POMCP')}**" if p == HEADLINE else p.removesuffix("-POMCP") for p in planners]
+    table = ["|  | " + " | ".join(names) + " |", "| --- |" + " ---: |" * len(names)]
+    for family in dict.fromkeys(family for family, _ in lines):
+        mine = [lines[family, p] for p in planners]
+        shares = [f"{100 * x.atcr.value:.1f} [{100 * x.atcr.low:.0f}, {100 * x.atcr.high:.0f}]" for x in mine]
+        steps = [f"{x.steps.value:.0f} [{x.steps.low:.0f}, {x.steps.high:.0f}]" for x in mine]
+        table.append(f"| `{family}`, ATCR % | " + " | ".join(shares) + " |")
+        table.append(f"| `{family}`, StI | " + " | ".join(steps) + " |")
+    return "\n".join(table)
+
+
+def record(stored: StoredSettings, runs: list[dict[str, str]], count: int, checksum: str) -> str:
+    """What was run, on what, and the checksum of its rows."""
+    table = ["| | |", "| --- | --- |", f"| rows | {count} |", f"| sha256 of the rows | `{checksum}` |"]
+    table.append(f"| settings | `{stored.key}` |")
+    for run in runs:
+        table += [f"| {key} | {value} |" for key, value in run.items()]
+    return "\n".join(table)
+
+
+if __name__ == "__main__":
+    typer.run(main)
