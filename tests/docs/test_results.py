@@ -23,6 +23,8 @@ def episodes() -> pd.DataFrame:
 def test_the_checksum_on_the_page_is_that_of_the_rows(episodes: pd.DataFrame) -> None:
     page = (FOLDER / "README.md").read_text()
     assert f"`{export.checksum(episodes)}`" in page and f"| rows | {len(episodes)} |" in page
+    perimeter = pd.read_csv(FOLDER / "perimeter.csv.xz")
+    assert f"`{export.checksum(perimeter)}`" in page and (perimeter["family"] == "perimeter").all()
     assert episodes["error"].isna().all(), "a broken episode would have to be explained on the page"
     assert (episodes.groupby(["mission", "family", "planner"]).size() == 150).all()
 
