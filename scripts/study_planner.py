@@ -1,7 +1,7 @@
 """How near TAB-POMCP comes to its ceiling, and what a decision's budget buys: ``python scripts/study_planner.py``.
 
-Rows (one per episode, CSV) are appended as episodes end, so an interrupted run continues; ``study_planner_report.py`` draws the figure and
-prints the tables from rows alone. Base seed 40000: the published table's seeds are not touched.
+Rows (one per episode, CSV) are appended as episodes end, so an interrupted run continues; ``study_planner_report.py`` draws the
+figure and prints the tables from rows alone. Base seed 40000: the published table's seeds are not touched.
 """
 
 from __future__ import annotations
