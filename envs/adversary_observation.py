@@ -45,6 +45,7 @@ from tab_marl.mission.compile import compile_mission
 from tab_marl.mission.model import Mission
 from tab_marl.mission.route import RouteField, solve_route
 from tab_marl.world.grid import GridMap
+from tab_marl.world.regions import Region
 from tab_marl.world.scenario import Scenario
 
 LAYOUT_VERSION = 1
@@ -129,8 +130,10 @@ class _Plain:
 
     scenario: Scenario
     automaton: MissionAutomaton
+    failing: tuple[Region, ...]
+    """Regions that fail the mission."""
     zone_distance: NDArray[np.float64]
-    """``[S]`` metres to the nearest region that fails the mission, inf if there is none."""
+    """``[S]`` metres to the nearest of them, inf if there is none."""
     clearance: NDArray[np.float64]
     route: RouteField
     home: int
@@ -139,15 +142,22 @@ class _Plain:
 
     @classmethod
     def of(cls, scenario: Scenario, automaton: MissionAutomaton, grid: GridMap) -> _Plain:
+        failing = tuple(r for r, fails in zip(automaton.regions, zones(automaton).T, strict=True) if fails.any())
         zone_distance = np.full(grid.cells, np.inf)
-        for region, fails in zip(automaton.regions, zones(automaton).T, strict=True):
-            if fails.any():
-                zone_distance = np.minimum(zone_distance, region.distance(grid.centres))
+        for region in failing:
+            zone_distance = np.minimum(zone_distance, region.distance(grid.centres))
         clearance = clearance_cost(grid, zone_distance)
         windows = later_windows(automaton, round(scenario.horizon_seconds / automaton.tick_seconds))
         home = automaton.first(int(automaton.masks(scenario.adversary_start.centre)[0])).location
         return cls(
-            scenario, automaton, zone_distance, clearance, solve_route(automaton, grid, clearance), home, windows
+            scenario,
+            automaton,
+            failing,
+            zone_distance,
+            clearance,
+            solve_route(automaton, grid, clearance),
+            home,
+            windows,
         )
 
     def parts(self, latents: Latents, strength: float) -> Parts:
@@ -189,12 +199,11 @@ def _styled(plain: _Plain, latents: Latents) -> Parts:
 
 def _crossed(plain: _Plain, place_metres: dict[str, float]) -> NDArray[np.int64]:
     """``[S, 16]``: fences across the first leg of the shortest way to the places chosen if they cost so much more."""
-    grid, automaton = plain.route.grid, plain.automaton
-    chosen = solve_route(automaton, grid, plain.clearance, place_metres=place_metres)
+    grid = plain.route.grid
+    chosen = solve_route(plain.automaton, grid, plain.clearance, place_metres=place_metres)
     cells, locations = chosen.path(plain.home, plain.scenario.adversary_start.centre)
     leg = grid.centres[cells[: int(np.argmax(locations != plain.home)) + 1]]
-    failing = [region for region, fails in zip(automaton.regions, zones(automaton).T, strict=True) if fails.any()]
-    return fences_crossed(grid, [*plain.scenario.obstacles, *failing], leg)
+    return fences_crossed(grid, [*plain.scenario.obstacles, *plain.failing], leg)
 
 
 def _via_points(

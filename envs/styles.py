@@ -227,8 +227,7 @@ def fences_crossed(grid: GridMap, regions: Sequence[Region], way: NDArray[np.flo
     between = (way[1:] + way[:-1]) / 2
     for region in regions:
         nearest = between[int(np.argmin(region.distance(between)))]
-        x_min, y_min, x_max, y_max = region.bounds()
-        middle = np.array([(x_min + x_max) / 2, (y_min + y_max) / 2])
+        middle = np.asarray(region.centre)
         length = float(np.hypot(*(nearest - middle)))
         if length == 0.0:
             continue

@@ -1,7 +1,7 @@
-"""Keep a run as the project's published result: ``python scripts/publish_results.py --out runs/paper``.
+"""Keep runs as the project's published result: ``python scripts/publish_results.py --out runs/paper --control runs/perimeter``.
 
-Writes the rows (compressed CSV) and figures into docs/results, and fills the tables between the marks of docs/results/README.md and
-of the README. What the tables mean is written there by hand.
+Writes their rows (compressed CSV) and figures into docs/results, and fills the tables between the marks of docs/results/README.md
+and of the README. What the tables mean is written there by hand.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import typer
 
 import tab_marl
 from tab_marl.evaluation import decision_times
+from tab_marl.evaluation.errors import UserError
 from tab_marl.evaluation.export import export
 from tab_marl.evaluation.population_study import put_tables
 from tab_marl.evaluation.provenance import describe_runs
@@ -23,21 +24,35 @@ from tab_marl.evaluation.settings import HEADLINE, PLANNERS
 from tab_marl.evaluation.store import Store, StoredSettings
 from tab_marl.evaluation.tables import ALL
 
-ROWS = "episodes.csv.xz"
 RECORDED = ("started", "ended", "episodes", "engine", "machine", "commit", "code", "versions", "zoo")
 
 
 def main(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the run.")] = Path("runs/paper"),
+    control: Annotated[Path, typer.Option(help="Folder of the run of family perimeter.")] = Path("runs/perimeter"),
     docs: Annotated[Path, typer.Option(help="Folder of the pages.")] = Path("docs"),
     readme: Annotated[Path, typer.Option(help="The page with the short table.")] = Path("README.md"),
 ) -> None:
     """Write rows, figures and tables of the latest settings that were played there."""
     folder = docs / "results"
+    found = published(out, folder, "episodes")
+    found |= {f"control-{name}": table for name, table in published(control, folder, "perimeter").items()}
+    for path in (folder / "README.md", readme):
+        text = path.read_text(encoding="utf-8")
+        marked = {name: table for name, table in found.items() if f"<!-- begin {name} -->" in text}
+        path.write_text(put_tables(text, marked), encoding="utf-8")
+        print(f"{path}: {', '.join(marked)}")
+
+
+def published(out: Path, folder: Path, rows_name: str) -> dict[str, str]:
+    """The tables of a run by name, as Markdown; its rows and figures go into the folder. Raises UserError."""
     with Store.open(out) as store:
-        stored = next(s for s in store.settings() if s.rows)
+        known = [s for s in store.settings() if s.rows]
+        if not known:
+            raise UserError(f"{out}: no episode is stored here yet; run tab-marl evaluate")
+        stored = known[0]
         rows, timings = store.rows(stored.key), store.timings(stored.key)
-        count, checksum = export(store, stored.key, "csv", folder / ROWS)
+        count, checksum = export(store, stored.key, "csv", folder / f"{rows_name}.csv.xz")
         runs = [{key: run[key] for key in RECORDED} for run in describe_runs(store.runs(stored.key))]
     cards = describe_adversaries(stored.content["adversaries"])
     results = compute(ReportData(rows, timings, stored.content, stored.key, (), None, cards, tab_marl.__version__, {}))
@@ -46,11 +61,7 @@ def main(
     found["summary"] = summary(results)
     found["record"] = record(stored, runs, count, checksum)
     found["time"] = "```text\n" + "\n".join(decision_times.summary(timings)) + "\n```"
-    for path in (folder / "README.md", readme):
-        text = path.read_text(encoding="utf-8")
-        marked = {name: table for name, table in found.items() if f"<!-- begin {name} -->" in text}
-        path.write_text(put_tables(text, marked), encoding="utf-8")
-        print(f"{path}: {', '.join(marked)}")
+    return found
 
 
 def summary(results: Results) -> str:

@@ -10,6 +10,7 @@ import typer
 from rich.progress import Progress
 
 from tab_marl.agents.measures.diversity import Yardstick
+from tab_marl.agents.measures.measuring import Sheet
 from tab_marl.agents.measures.release import release_moves
 from tab_marl.agents.policies.zoo import SHIPPED, load_zoo
 from tab_marl.evaluation import population_figures as figures
@@ -56,6 +57,18 @@ def telling(yardsticks: Sequence[Yardstick], mission: str, family: str) -> Yards
         return min(y.task.slack, 2.2) * metres * (1 + sum(bool(y.sides.two_sided(place)) for place in places))
 
     return max((y for y in yardsticks if (y.task.mission_id, y.task.family) == (mission, family)), key=choice)
+
+
+@app.command()
+def side(
+    zoo: Annotated[Path, typer.Option(help="Folder of the policies.")] = SHIPPED,
+    tasks: Annotated[int, typer.Option(min=15, help="Held-out tasks that every policy plays, twice.")] = 150,
+    seed: Annotated[int, typer.Option(help="Of the tasks; the page's tables are of another.")] = 1234,
+) -> None:
+    """How often the shortest path's side is taken on other tasks than those the page shows."""
+    sheet = Sheet.draw(tasks, 0, tasks, seed)
+    share, low, high, n = tables.shortest_side([sheet.behaviour(policy) for policy in load_zoo(zoo)])
+    print(f"{100 * share:.0f} % [{100 * low:.0f}, {100 * high:.0f}] of {n} episodes")
 
 
 @app.command()

@@ -74,7 +74,7 @@ class Sides:
         direct = float(travel.to((place,))[home])
         centres = []
         for region in (*scenario.obstacles, *avoided):
-            centre = _centre(region)
+            centre = np.asarray(region.centre)
             around = self._around(region, centre, way.path, place, avoided)[home]
             detour = float(around) - direct
             if detour <= min(MOST_DETOUR * direct, scenario.adversary.max_speed * spare):
@@ -115,8 +115,3 @@ def winding_number(loop: Array, point: Array) -> int:
     x, y = (loop - point).T
     turned = np.diff(np.arctan2(y, x))
     return round(float(((turned + math.pi) % (2 * math.pi) - math.pi).sum()) / (2 * math.pi))
-
-
-def _centre(region: Region) -> Array:
-    x_min, y_min, x_max, y_max = region.bounds()
-    return np.array([(x_min + x_max) / 2, (y_min + y_max) / 2])

@@ -26,7 +26,7 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from tab_marl.agents.training.hyperparameters import HyperparameterError, check
-from tab_marl.agents.training.settings import TrainingError, TrainingSettings, as_toml, read_toml
+from tab_marl.agents.training.settings import TrainingError, TrainingSettings, as_toml, first_line, read_toml
 from tab_marl.envs.styles import STYLES, Style, mixture_of
 from tab_marl.world.scenario import UnknownName
 
@@ -144,7 +144,7 @@ def _mixture(styles: Sequence[Any], where: str) -> dict[str, Any]:
             try:
                 found.append(TypeAdapter(Style).validate_python(style))
             except ValidationError as error:
-                raise TrainingError(f"{where}: style {style}: {error.errors()[0]['msg']}") from None
+                raise TrainingError(f"{where}: style: {first_line(error)}") from None
         elif isinstance(style, str) and style in STYLES:
             found.append(STYLES[style])
         else:

@@ -109,6 +109,7 @@ seeds = [3, 5]
         ("[[member]]\nstyle = ['late', 'latte']", "did you mean 'late'"),
         ("[[member]]\nstyle = ['late', ['side']]", "style"),
         ("[[member]]\nstyle = ['late', { name = 'x', side = 2.0 }]", "Style.side is 2.0, must be a probability"),
+        ("[[member]]\nstyle = ['late', { name = 'x', shy = 2.0 }]", "style: shy: "),
         ("[[member]]\nsplit = 'test'", "split"),
         ("[[member]]\nalgorithm = 'dqn'", "algorithm"),
         ("[[member]]\n[member.map]\ncheckpoints = 0", "map.*checkpoints is 0"),

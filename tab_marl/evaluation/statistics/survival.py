@@ -84,7 +84,8 @@ def log_log_bounds(value: Floats, variance: Floats, known: ArrayLike) -> tuple[F
     count = np.maximum(np.asarray(known, dtype=np.float64), 1.0)
     inside = (value > 0) & (value < 1)
     f = np.where(inside, value, 0.5)
-    spread = np.exp(z * np.sqrt(variance) / (f * np.abs(np.log(f))))
+    with np.errstate(over="ignore"):  # infinite where a share is all but 0 or 1: the bounds are then 0 and 1
+        spread = np.exp(z * np.sqrt(variance) / (f * np.abs(np.log(f))))
     tail = ((1 - CONFIDENCE) / 2) ** (1 / count)
     low = np.where(inside, f**spread, np.where(value >= 1, tail, 0.0))
     high = np.where(inside, f ** (1 / spread), np.where(value <= 0, 1 - tail, 1.0))
