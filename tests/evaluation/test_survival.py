@@ -113,6 +113,17 @@ def test_nothing_happened_is_not_certainty():
     assert every.value[-1] == 1 and every.low[-1] == pytest.approx(0.025 ** (1 / 20))
 
 
+@pytest.mark.parametrize("count", [3, 49, 60, 291])
+def test_a_share_that_rounds_to_one_is_one(count):
+    """Steps of 1/n seldom add up to 1 exactly; on the scale log(-log F) what is missing would open the band to [0, 1]."""
+    curve = survival.cumulative_incidence(np.arange(1.0, count + 1), np.ones(count, dtype=int))
+    mean = survival.mean_curve([curve] * 3, [count + 1.0])
+    for low, high, known in ((curve.low, curve.high, count), (mean.low, mean.high, 3 * count)):
+        assert low[-1] == pytest.approx(0.025 ** (1 / known)) and high[-1] == 1
+    nothing = survival.mean_curve([survival.cumulative_incidence([1.0] * count, [2] * count)], [2.0])
+    assert nothing.low[0] == 0 and nothing.high[0] == pytest.approx(1 - 0.025 ** (1 / count))
+
+
 def test_mean_of_curves_weighs_missions_equally():
     many = survival.cumulative_incidence(np.ones(90), np.ones(90, dtype=int))
     few = survival.cumulative_incidence(np.full(10, 3.0), np.zeros(10, dtype=int))

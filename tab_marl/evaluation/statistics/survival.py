@@ -18,6 +18,9 @@ from tab_marl.evaluation.statistics.intervals import CONFIDENCE, Floats
 CENSORED = 0
 """The cause of an episode in which nothing happened up to its horizon."""
 
+ROUNDING = 1e-9
+"""What a sum of steps may be off by; one episode in a million is a thousand times as much."""
+
 
 @dataclass(frozen=True)
 class Curve:
@@ -82,13 +85,14 @@ def log_log_bounds(value: Floats, variance: Floats, known: ArrayLike) -> tuple[F
     """95 % bounds of shares on the scale log(-log F); exact binomial bounds of `known` episodes where F is 0 or 1."""
     z = float(stats.norm.ppf((1 + CONFIDENCE) / 2))
     count = np.maximum(np.asarray(known, dtype=np.float64), 1.0)
-    inside = (value > 0) & (value < 1)
+    # A share that is 0 or 1 but for the rounding of its sum has no interval on that scale: log(-log F) runs away.
+    nothing, everything = value < ROUNDING, value > 1 - ROUNDING
+    inside = ~(nothing | everything)
     f = np.where(inside, value, 0.5)
-    with np.errstate(over="ignore"):  # infinite where a share is all but 0 or 1: the bounds are then 0 and 1
-        spread = np.exp(z * np.sqrt(variance) / (f * np.abs(np.log(f))))
+    spread = np.exp(z * np.sqrt(variance) / (f * np.abs(np.log(f))))
     tail = ((1 - CONFIDENCE) / 2) ** (1 / count)
-    low = np.where(inside, f**spread, np.where(value >= 1, tail, 0.0))
-    high = np.where(inside, f ** (1 / spread), np.where(value <= 0, 1 - tail, 1.0))
+    low = np.where(inside, f**spread, np.where(everything, tail, 0.0))
+    high = np.where(inside, f ** (1 / spread), np.where(nothing, 1 - tail, 1.0))
     return low, high
 
 
