@@ -60,6 +60,10 @@ class RockSampleData(NamedTuple):
     """Log odds below which `survey_rollout` gives a rock up."""
     trust: float
     """Log odds from which it goes without another check."""
+    discount: float
+    """With which the prior `preferred` reckons."""
+    pseudo_count: int
+    """How often it pretends to have tried each action."""
 
 
 def rock_sample_data(
@@ -108,6 +112,8 @@ def rock_sample_data(
         6.0,
         -0.1,
         1.5,
+        0.95,
+        100,
     )
 
 
@@ -115,15 +121,16 @@ def rock_sample(
     size: int = 7,
     rocks: int = 8,
     rollout: Literal["survey", "harvest", "legal", "engine"] = "survey",
-    sensible: bool = True,
+    prior: Literal["preferred", "sensible", "none"] = "preferred",
     data: RockSampleData | None = None,
 ) -> CompiledModel:
     """RockSample[size, rocks] as a compiled model of ``5 + rocks`` actions.
 
     `rollout`: "survey" goes to the nearest rock that may be good, checking it until sure, then to the next, and leaves; "harvest"
     collects only what is more likely good than not, without a check; "legal" is uniform among actions that make sense; "engine"
-    is uniform among all, with -100 at every border. `sensible` forbids, as a prior, what cannot pay: walking into a border,
-    sampling bare ground, checking a rock known beyond doubt.
+    is uniform among all, with -100 at every border. `prior`: "sensible" forbids what cannot pay (walking into a border, sampling
+    bare ground, checking a rock known beyond doubt); "preferred" also starts every action with a guess of its value, by which
+    the survey policy is left only for what shows itself to be better (preferred actions: Silver and Veness, section 5).
     """
     data = rock_sample_data(size, rocks) if data is None else data
     function = {
@@ -138,7 +145,7 @@ def rock_sample(
         2 + data.rocks,
         data,
         rollout=function,
-        prior=kernels.sensible if sensible else None,
+        prior={"preferred": kernels.preferred, "sensible": kernels.sensible, "none": None}[prior],
         action_names=("north", "east", "south", "west", "sample", *(f"check {k}" for k in range(data.rocks))),
         upper=kernels.upper,
     )
