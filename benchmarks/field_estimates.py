@@ -35,7 +35,7 @@ CASES = {
         "Reach Checkpoint A then Checkpoint C within 40s", LAB, FieldOptions(reference="unicycle", cell_metres=0.1),
     ),
     "any of three, default": ("Visit any three different checkpoints within 40s", LAB, FieldOptions(cell_metres=0.1)),
-    "M5, mission alone": (M5, LAB, FieldOptions(cell_metres=0.1, goal_marginals=False)),
+    "M5, mission alone": (M5, LAB, FieldOptions(cell_metres=0.1, goal_marginals=0.0)),
     "M5, default": (M5, LAB, FieldOptions()),
     "3-D, walk, 0.25 m": (SPACE, TANK, FieldOptions(reference="walk", cell_metres=0.25)),
     "3-D, run-and-tumble, 0.5 m": (SPACE, TANK, FieldOptions(cell_metres=0.5)),

@@ -53,14 +53,14 @@ def m5(reference: str, **options: object) -> FieldProblem:
     settings = {
         "cell_metres": 0.05,
         "reference": reference,
-        "goal_marginals": False,
+        "goal_marginals": 0.0,
         "memory_gigabytes": 16.0,
     } | options
     return FieldProblem.from_mission(M5, LAB, FieldOptions(**settings))  # type: ignore[arg-type]
 
 
 def tank() -> FieldProblem:
-    options = FieldOptions(cell_metres=0.2, reference="walk", goal_marginals=False)
+    options = FieldOptions(cell_metres=0.2, reference="walk", goal_marginals=0.0)
     return FieldProblem.from_mission("Reach Ball 1 then Ball 2 then Ball 3 then Ball 4 within 100 s", TANK, options)
 
 
@@ -68,7 +68,7 @@ CASES: dict[str, Callable[[], FieldProblem]] = {
     "M5, 5 cm, walk": lambda: m5("walk"),
     "M5, 5 cm, run-and-tumble": lambda: m5("run_and_tumble"),
     "M5, 5 cm, run-and-tumble, everywhere": lambda: m5("run_and_tumble", only_reachable=False),
-    "M5, 5 cm, run-and-tumble, equal goals": lambda: m5("run_and_tumble", goal_marginals=True),
+    "M5, 5 cm, run-and-tumble, equal goals": lambda: m5("run_and_tumble", goal_marginals=1.0),
     "3-D, 4 stages, 200 ticks, walk": tank,
 }
 WITHOUT_SCIPY = ("M5, 5 cm, run-and-tumble, everywhere", "M5, 5 cm, run-and-tumble, equal goals")
@@ -121,7 +121,7 @@ def timed(work: Callable[[], object]) -> tuple[float, object]:
 def measure(name: str, side: str, repeats: int) -> dict[str, float]:
     """In this process: build, solve, and what they took."""
     build = CASES[name]
-    warm = FieldOptions(cell_metres=0.25, goal_marginals="equal" in name, reference=build().options.reference)
+    warm = FieldOptions(cell_metres=0.25, goal_marginals=float("equal" in name), reference=build().options.reference)
     solve(FieldProblem.from_mission("Reach any two different checkpoints within 20s", LAB, warm))
     seconds, building = [], []
     field: TabField | float
@@ -200,7 +200,7 @@ PLACES = ("Checkpoint A", "Checkpoint B", "Checkpoint C", "Checkpoint D", "Check
 def sized(cell_metres: float, stages: int, ticks: int) -> FieldProblem:
     words = "Reach " + ", then ".join(PLACES[:stages]) + f" within {ticks * 0.5} s"
     scenario = replace(LAB, obstacles=(), horizon_seconds=ticks * 0.5)
-    options = FieldOptions(cell_metres=cell_metres, reference="walk", goal_marginals=False, only_reachable=False)
+    options = FieldOptions(cell_metres=cell_metres, reference="walk", goal_marginals=0.0, only_reachable=False)
     return FieldProblem.from_mission(words, scenario, options)
 
 

@@ -1,21 +1,23 @@
 """How near TAB-POMCP comes to its ceiling, and what a decision's budget buys: ``python scripts/study_planner.py``.
 
 Rows (one per episode, CSV) are appended as episodes end, so an interrupted run continues; ``study_planner_report.py`` draws the
-figure and prints the tables from rows alone. Base seed 40000: the published table's seeds are not touched.
+figure and prints the tables from rows alone. The published table's seeds are not touched; its policies are only with
+``--split final``.
 """
 
 from __future__ import annotations
 
 import csv
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
 
-from tab_marl.agents.planners import PlannerAgent, PlannerOptions
-from tab_marl.evaluation.adversaries import opponent, zoo_names
+from tab_marl.agents.planners import GUARDS, PlannerAgent, PlannerOptions
+from tab_marl.agents.policies.cards import Split
+from tab_marl.evaluation.adversaries import opponent, population, zoo_names
 from tab_marl.evaluation.episode import run_episode
 from tab_marl.evaluation.units import Unit, unit_seeds
 from tab_marl.field.problem import FieldOptions
@@ -24,7 +26,6 @@ from tab_marl.planning.pursuit.decide import PursuitOptions
 from tab_marl.planning.pursuit.itineraries import EFFORT
 from tab_marl.planning.pursuit.scenarios import ReuseOptions
 
-BASE_SEED = 40_000
 FIELDS = (
     "variant", "family", "mission", "seed", "adversary", "slack", "intercepted", "completed", "physics_steps",
     "horizon_steps", "decisions", "belief_ms", "sampling_ms", "valuation_ms", "search_ms", "worst_ms",
@@ -37,10 +38,17 @@ class Variant:
 
     planner: str
     options: PlannerOptions = field(default_factory=PlannerOptions)
+    knows: Literal["those played", "the others"] = "those played"
+    """Whose paths population-POMCP draws: of the split that is played, or of the other one."""
 
 
 def pursuing(planner: str, milliseconds: float = 20, **changes: Any) -> Variant:
     return Variant(planner, PlannerOptions(pursuit=PursuitOptions.for_milliseconds(milliseconds, **changes)))
+
+
+def predicting(**changes: Any) -> Variant:
+    """TAB-POMCP with another field."""
+    return Variant("TAB-POMCP", PlannerOptions(tab_field=FieldOptions(**changes)))
 
 
 OPEN_LOOP = {"method": "routes", "detours": 0, "paths": 200, "screened": 1000, "keep_bonus": 0.0}
@@ -51,8 +59,12 @@ VARIANTS: dict[str, Variant] = {
     "routes": pursuing("TAB-POMCP", method="routes"),
     **{f"tree {effort.milliseconds:g} ms": pursuing("TAB-POMCP", effort.milliseconds) for effort in EFFORT},
     "population": pursuing("population-POMCP"),
+    "population 50 ms": pursuing("population-POMCP", 50),
+    "population of others": replace(pursuing("population-POMCP"), knows="the others"),
+    "population of others 50 ms": replace(pursuing("population-POMCP", 50), knows="the others"),
     "oracle": pursuing("oracle"),
     "S-POMCP": pursuing("S-POMCP"),
+    "FP-POMCP": pursuing("FP-POMCP"),
     "tree, nothing kept": Variant("TAB-POMCP", PlannerOptions(reuse=ReuseOptions(renewed_share=1.0))),
     "tree, c = 1": pursuing("TAB-POMCP", exploration=1.0),
     "tree, c = 25": pursuing("TAB-POMCP", exploration=25.0),
@@ -60,16 +72,27 @@ VARIANTS: dict[str, Variant] = {
     "tree, branches on sightings": pursuing("TAB-POMCP", branch_on_sightings=True),
     "tree, no changes in rollouts": pursuing("TAB-POMCP", switches=0),
     "tree, no detours": pursuing("TAB-POMCP", detours=0),
-    "tree, nearer goals likelier": Variant("TAB-POMCP", PlannerOptions(tab_field=FieldOptions(goal_marginals=False))),
+    "tree, nearer goals likelier": predicting(goal_marginals=0.0),
+    "tree, nearer goals half as much": predicting(goal_marginals=0.5),
+    "tree, timing prior": predicting(timing_prior=True),
+    "tree, drive and turn": predicting(reference="drive_and_turn"),
+    "tree, runs of 0.5 m": predicting(mean_run_metres=0.5),
+    "tree, runs of 2 m": predicting(mean_run_metres=2.0),
+    "tree, guarded": Variant("TAB-POMCP", PlannerOptions(guards=(*GUARDS, ("TAB-POMCP", 0.2)))),
     "tree, rewards as they are": pursuing("TAB-POMCP", completion_weight=1.0),
+    "tree, completion at 10 times": pursuing("TAB-POMCP", completion_weight=10.0),
 }
 
 
-def play(name: str, variant: Variant, task: Task, unit: Unit, warm: bool = False) -> dict[str, object]:
+def play(
+    name: str, variant: Variant, task: Task, unit: Unit, split: Split, base_seed: int, warm: bool = False
+) -> dict[str, object]:
     """One episode, as a row."""
-    _, episode_seed, planner_seed = unit_seeds(BASE_SEED, unit)
-    names = zoo_names("development")
-    agent = PlannerAgent(variant.planner, variant.options)
+    _, episode_seed, planner_seed = unit_seeds(base_seed, unit)
+    names = zoo_names(split)
+    other: Split = "final" if split == "development" else "development"
+    known = population(names if variant.knows == "those played" else zoo_names(other))
+    agent = PlannerAgent(variant.planner, replace(variant.options, rollouts=known))
     policy = opponent(names[unit.seed % len(names)])
     row = run_episode(
         task, agent, policy, episode_seed, False, unit.seed, planner_seed, max_steps=11 if warm else None
@@ -96,8 +119,13 @@ def run(
     first: int = 0,
     count: int = 150,
     out: Path = Path("runs/planner.csv"),
+    split: Annotated[str, typer.Option(help="whose policies play: development or final")] = "development",
+    base_seed: int = 40_000,
 ) -> None:
     """Play what is not yet in the file, seed by seed."""
+    if split not in ("development", "final"):
+        raise typer.BadParameter(f"split is {split!r}, must be 'development' or 'final'")
+    played: Split = "final" if split == "final" else "development"
     out.parent.mkdir(parents=True, exist_ok=True)
     done = set()
     if out.exists():
@@ -114,12 +142,12 @@ def run(
                 wanted = [v for v in variants.split(";") if (v, family, mission, seed) not in done]
                 if not wanted:
                     continue
-                task = sample_task(np.random.default_rng(unit_seeds(BASE_SEED, unit)[0]), mission, family)
+                task = sample_task(np.random.default_rng(unit_seeds(base_seed, unit)[0]), mission, family)
                 for name in wanted:
                     if name not in warmed:
                         warmed.add(name)
-                        play(name, VARIANTS[name], task, unit, warm=True)
-                    writer.writerow(play(name, VARIANTS[name], task, unit))
+                        play(name, VARIANTS[name], task, unit, played, base_seed, warm=True)
+                    writer.writerow(play(name, VARIANTS[name], task, unit, played, base_seed))
                     file.flush()
 
 

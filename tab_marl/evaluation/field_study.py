@@ -53,15 +53,15 @@ VARIED = FieldOptions(reference="drive_and_turn", mean_run_metres=1.0)
 
 
 def _fields() -> Iterator[tuple[str, FieldOptions]]:
-    yield "paper walk", FieldOptions(reference="paper_walk", goal_marginals=False)
+    yield "paper walk", FieldOptions(reference="paper_walk", goal_marginals=0.0)
     for name, motion in {
         "walk": FieldOptions(reference="walk"),
         "tumble": FieldOptions(reference="run_and_tumble", mean_run_metres=1.0),
         "drive": VARIED,
     }.items():
-        yield name, replace(motion, goal_marginals=False)
+        yield name, replace(motion, goal_marginals=0.0)
         yield f"{name} + goals", motion
-        yield f"{name} + timing", replace(motion, goal_marginals=False, timing_prior=True)
+        yield f"{name} + timing", replace(motion, goal_marginals=0.0, timing_prior=True)
         yield f"{name} + goals + timing", replace(motion, timing_prior=True)
     yield "unicycle + goals", FieldOptions(reference="unicycle")
     yield "tumble 0.5 m + goals", FieldOptions(reference="run_and_tumble", mean_run_metres=0.5)

@@ -25,8 +25,9 @@ class FieldOptions:
     """Of run-and-tumble and drive-and-turn. 0.5 predicts slightly better, 1 intercepts sooner (docs/studies/field.md)."""
     rest_seconds: float = 10.0
     """How long a rest lasts on average, in drive-and-turn."""
-    goal_marginals: bool = True
-    """Where several places can serve, each is visited equally often."""
+    goal_marginals: float = 1.0
+    """How equally places that can stand for one another are visited: 1, each as often as the others; 0, as the mission and the
+    motion have it, by which the farthest is hardly ever chosen; between, that much of the one and the rest of the other."""
     timing_prior: bool = False
     """The completion tick is uniform over the feasible ticks."""
     completion_probability: float = 1.0
@@ -72,6 +73,10 @@ class FieldOptions:
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise ValueError(f"FieldOptions.{name} is {value}, must be > 0")
+        if not 0 <= self.goal_marginals <= 1:
+            raise ValueError(
+                f"FieldOptions.goal_marginals is {self.goal_marginals}, must lie in [0, 1]: 1 for equal shares, 0 for none of it"
+            )
         if not 0 < self.completion_probability <= 1:
             raise ValueError(
                 f"FieldOptions.completion_probability is {self.completion_probability}, must lie in (0, 1]"
@@ -84,7 +89,7 @@ class FieldOptions:
     @classmethod
     def preset(cls, name: str) -> FieldOptions:
         """`default`, or `paper`: the literal field (memoryless, the mission alone) with displacements repaired."""
-        presets = {"default": cls(), "paper": cls(reference="walk", goal_marginals=False)}
+        presets = {"default": cls(), "paper": cls(reference="walk", goal_marginals=0.0)}
         if name not in presets:
             raise UnknownName("field preset", name, presets)
         return presets[name]

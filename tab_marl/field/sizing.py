@@ -293,7 +293,7 @@ def _counting(problem: FieldProblem, rows: int) -> FieldProblem:
     start[:: max(1, problem.cells // START_CELLS)] = 1.0
     start /= start.sum()
     options = replace(
-        problem.options, goal_marginals=False, timing_prior=False, completion_probability=1.0, only_reachable=False
+        problem.options, goal_marginals=0.0, timing_prior=False, completion_probability=1.0, only_reachable=False
     )
     return replace(
         problem, automaton=automaton, start=start, options=options, reference_of=None, stage=None, stage_names=("mission",),

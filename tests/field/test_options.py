@@ -55,6 +55,29 @@ def test_goal_marginals_make_the_far_goal_as_likely_as_the_near():
     np.testing.assert_allclose(list(shares[True].values()), 0.25, rtol=0.05)
 
 
+def test_half_equal_goal_marginals_are_the_mixture_of_equal_and_free_ones():
+    """Where a mission ends at one of several goals, a weight on the goal is all that differs between the three laws."""
+    mission = Mission((Constraint("deadline", PLACES[:4], seconds=24),))
+    settings = {"cell_metres": 0.1, "marginal_tolerance": 1e-9, "precision": "double"}
+    laws = []
+    for share in (0.0, 0.5, 1.0):
+        problem = FieldProblem.from_mission(mission, LAB, FieldOptions(goal_marginals=share, **settings))
+        one = np.zeros(problem.cells)  # with several starts the weights also shift what goes from where to where
+        one[np.argmax(problem.start)] = 1.0
+        laws.append(solve(replace(problem, start=one)))
+    free, half, equal = laws
+    for name, share in half.branch_shares.items():
+        assert share == pytest.approx((free.branch_shares[name] + equal.branch_shares[name]) / 2, abs=1e-7)
+    for tick in (5, 20, 40):
+        mixed = (free.occupancy[tick] + equal.occupancy[tick]) / 2
+        np.testing.assert_allclose(half.occupancy[tick], mixed, atol=1e-7)
+
+
+def test_shares_of_goals_need_a_number_between_0_and_1():
+    with pytest.raises(ValueError, match=r"goal_marginals is 1\.5, must lie in \[0, 1\]"):
+        FieldOptions(goal_marginals=1.5)
+
+
 def test_goals_out_of_reach_get_no_equal_share():
     """Within 7 s, C and D can be reached; A and B only by a walker that cell rounding lets run."""
     seconds = {place: shortest_seconds(LAB, place) for place in PLACES[:4]}

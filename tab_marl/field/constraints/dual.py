@@ -20,7 +20,7 @@ from tab_marl.field.chain import ProductChain
 from tab_marl.field.constraints.contradiction import ContradictoryConstraints, explain
 from tab_marl.field.constraints.events import Completes, SoftConstraint, TimingPrior
 from tab_marl.field.constraints.report import ConstraintFit, FitReport
-from tab_marl.field.constraints.tilt import Tilt, alternatives, reachable_places, ticks_of
+from tab_marl.field.constraints.tilt import Tilt, alternatives, goal_shares, reachable_places, ticks_of
 from tab_marl.field.infeasible import InfeasibleField
 from tab_marl.field.problem import COMPLETE, FieldProblem
 from tab_marl.field.tab_field import expected_transitions, start_log_partition
@@ -199,7 +199,7 @@ def _own(constraint: SoftConstraint) -> bool:
 
 
 def _goal_marginals(built: _Builder) -> None:
-    """Each of several places that can serve is visited equally often."""
+    """Several places that can serve share their visits as `FieldOptions.goal_marginals` says."""
     problem, branch = built.problem, built.problem.automaton.branch
     names = problem.branch_places or tuple(str(b) for b in range(int(branch.max(initial=-1)) + 1))
     visits = np.bincount(branch[branch >= 0], built.flux[branch >= 0], minlength=len(names))
@@ -208,7 +208,8 @@ def _goal_marginals(built: _Builder) -> None:
         usable = usable[np.abs(visits[usable] - 1) > 1e-12] if len(usable) > 1 else usable
         if len(usable) > 1:
             each = [branch == b for b in usable]
-            built.shares([f"visits {names[b]}" for b in usable], each, np.full(len(usable), 1 / len(usable)))
+            shares = goal_shares(visits[usable], problem.options.goal_marginals)
+            built.shares([f"visits {names[b]}" for b in usable], each, shares)
 
 
 def _timing(built: _Builder, prior: TimingPrior) -> None:

@@ -1,4 +1,4 @@
-"""Constraints beyond the mission: equal goal marginals, uniform completion tick, completion with probability c.
+"""Constraints beyond the mission: goal marginals, uniform completion tick, completion with probability c.
 
 Each is a set of expectations under P. The minimiser of KL(P || Q) is then Q times a product of weights on transitions of
 the automaton (exponential tilting); `fitting` finds them.
@@ -55,6 +55,8 @@ class Tilt:
     """Feasible completion ticks."""
     tick_shares: Floats
     """Their wanted shares, sum 1."""
+    free_visits: Floats | None = None
+    """``[B]`` expected visits without the constraints; of the rough problem, where weights were fitted on one first."""
     fixed: Floats | None = None
     """``[Q, L]``: log of the factors, known from elsewhere (soft constraints, a file); then nothing is left to fit."""
 
@@ -148,6 +150,8 @@ class Tilt:
             if len(usable) > 1:
                 groups.append(usable)
         self.branch_groups = groups
+        if self.free_visits is None:
+            self.free_visits = visits
         if len(self.log_tick):
             share = self.completions(flux)
             target = self._uniform_ticks(share > least * max(share.sum(), 1e-300))
@@ -165,13 +169,18 @@ class Tilt:
         feasible[~feasible.any(axis=1)] = possible
         return np.asarray(start[used] @ (feasible / feasible.sum(axis=1, keepdims=True)))
 
+    def branch_shares(self, group: NDArray[np.int64]) -> Floats:
+        """Of the visits to a set of alternatives, what share each is wanted to have."""
+        assert self.free_visits is not None, "drop_infeasible comes first"
+        return goal_shares(self.free_visits[group], self.problem.options.goal_marginals)
+
     def residual(self, flux: Floats) -> Floats:
         """Log-ratios target / present of every constrained expectation: the scaling step, zero when all are met."""
         parts = []
         visits = self.visits(flux)
         for group in self.branch_groups:
             present = np.maximum(visits[group], 1e-300)
-            parts.append(np.log(present.mean()) - np.log(present))
+            parts.append(np.log(present.sum() * self.branch_shares(group)) - np.log(present))
         if len(self.ticks):
             present = np.maximum(self.completions(flux)[self.ticks], 1e-300)
             parts.append(np.log(present.sum() * self.tick_shares) - np.log(present))
@@ -194,8 +203,9 @@ class Tilt:
         return bool((automaton.delta[np.isin(automaton.branch, self.branch_groups[0])] == automaton.accepting).all())
 
     def start_from(self, other: Tilt) -> None:
-        """Take over the weights of the branches and of failure, fitted on another grid."""
+        """Take over the weights of the branches and of failure, fitted on another grid, and what was wanted there."""
         self.log_branch[:] = other.log_branch
+        self.free_visits = other.free_visits
         if np.isfinite(self.log_failure):
             self.log_failure = other.log_failure
 
@@ -221,6 +231,13 @@ class Tilt:
             at += len(self.ticks)
         if np.isfinite(self.log_failure):
             self.log_failure = float(vector[at])
+
+
+def goal_shares(free_visits: Floats, equality: float) -> Floats:
+    """``[n]``: shares between equal ones (`equality` 1) and those that visits without the constraint have (0)."""
+    total = float(free_visits.sum())
+    free = free_visits / total if total > 0 else np.full(len(free_visits), 1 / len(free_visits))
+    return equality / len(free) + (1 - equality) * free
 
 
 def alternatives(problem: FieldProblem) -> list[NDArray[np.int64]]:

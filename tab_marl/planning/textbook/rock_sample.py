@@ -11,6 +11,7 @@ Figures at discount .95 are in Ye et al. (JAIR 58, 2017) and, with preferred act
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -139,13 +140,18 @@ def rock_sample(
         "legal": kernels.legal_rollout,
         "engine": None,
     }[rollout]
+    priors: dict[str, Callable[..., None] | None] = {
+        "preferred": kernels.preferred,
+        "sensible": kernels.sensible,
+        "none": None,
+    }
     return CompiledModel(
         kernels.step,
         5 + data.rocks,
         2 + data.rocks,
         data,
         rollout=function,
-        prior={"preferred": kernels.preferred, "sensible": kernels.sensible, "none": None}[prior],
+        prior=priors[prior],
         action_names=("north", "east", "south", "west", "sample", *(f"check {k}" for k in range(data.rocks))),
         upper=kernels.upper,
     )
