@@ -19,9 +19,9 @@ import matplotlib.pyplot as plt
 Row = dict[str, str]
 Cell = dict[str, dict[int, Row]]
 """Rows by variant and seed."""
-REFERENCE = "tree 20 ms"
 PARTS = ("belief_ms", "sampling_ms", "valuation_ms", "search_ms")
 LINES = {"population": "#2a9d8f", "oracle": "#6c757d"}
+DASHES = {"population": "-", "oracle": "--"}
 MARKS = {"er": ("er", "#e07a1f", "s"), "routes": ("routes", "#8e5bb5", "D")}
 
 
@@ -39,7 +39,7 @@ def pooled(cells: list[Cell]) -> Cell:
     together: Cell = defaultdict(dict)
     for number, cell in enumerate(cells):
         for variant, rows in cell.items():
-            together[variant].update({1000 * number + seed: row for seed, row in rows.items()})
+            together[variant].update({(number << 32) + seed: row for seed, row in rows.items()})
     return together
 
 
@@ -53,12 +53,12 @@ def milliseconds(rows: dict[int, Row]) -> np.ndarray:
     return np.array([np.average(column(rows, part), weights=weights) for part in PARTS])
 
 
-def lines_of(title: str, cell: Cell) -> list[str]:
+def lines_of(title: str, cell: Cell, against: str) -> list[str]:
     """The table of one cell."""
     names = " ".join(f"{name:>6}" for name in ("StI", "ms", "belief", "paths", "values", "tree"))
     differences = f"{'ATCR - reference, points':>31} {'StI - reference':>29}"
     lines = [title, f"  {'variant':<28} {'n':>4} {'ATCR % [95 %]':>19} {names} {differences}"]
-    reference = cell.get(REFERENCE, {})
+    reference = cell.get(against, {})
     for variant, rows in cell.items():
         atcr, spent = share(column(rows, "completed")), milliseconds(rows)
         text = (
@@ -67,7 +67,7 @@ def lines_of(title: str, cell: Cell) -> list[str]:
             + " ".join(f"{part:>6.1f}" for part in spent)
         )
         both = sorted(set(rows) & set(reference))
-        if variant != REFERENCE and both:
+        if variant != against and both:
             missed = paired_shares(column(rows, "completed", both), column(reference, "completed", both))
             steps = paired_steps(column(rows, "physics_steps", both), column(reference, "physics_steps", both))
             d, s = missed.difference, steps.difference
@@ -92,7 +92,7 @@ def draw(panels: list[tuple[str, Cell]], out: Path) -> None:
         missed = {v: share(column(cell[v], "completed", seeds)) for v in shown}
         for variant, colour in LINES.items():
             if variant in missed:
-                axis.axhline(100 * missed[variant].value, color=colour, lw=1.5, label=variant)
+                axis.axhline(100 * missed[variant].value, color=colour, lw=1.5, ls=DASHES[variant], label=variant)
         x = [milliseconds(cell[v]).sum() for v in trees]
         y = [100 * missed[v].value for v in trees]
         bars = [
@@ -105,7 +105,7 @@ def draw(panels: list[tuple[str, Cell]], out: Path) -> None:
                 spent = milliseconds(cell[variant]).sum()
                 axis.plot(spent, 100 * missed[variant].value, marker, color=colour, ms=6, ls="none", label=name)
         axis.set(xscale="log", title=f"{title}, n = {len(seeds)}", xlabel="milliseconds a decision")
-        axis.set(xlim=(1, 1500), ylim=(-2, 62), xticks=[1, 10, 100, 1000], xticklabels=["1", "10", "100", "1,000"])
+        axis.set(xlim=(1, 1500), ylim=(-2, 45), xticks=[1, 10, 100, 1000], xticklabels=["1", "10", "100", "1,000"])
         axis.grid(alpha=0.25)
     handles, labels = np.atleast_1d(axes)[0].get_legend_handles_labels()
     np.atleast_1d(axes)[-1].legend(handles, labels, fontsize=8, frameon=False, loc="upper left")
@@ -116,7 +116,8 @@ def draw(panels: list[tuple[str, Cell]], out: Path) -> None:
 
 def main(
     rows: Annotated[Path, typer.Argument()] = Path("docs/studies/planner.csv"),
-    figure: Path = Path("docs/studies/planner.svg"),
+    figure: Annotated[Path | None, typer.Option(help="to draw; none without")] = None,
+    reference: Annotated[str, typer.Option(help="variant that the others are compared with")] = "tree 20 ms",
 ) -> None:
     cells = read(rows)
     families = sorted({family for family, _ in cells})
@@ -129,12 +130,13 @@ def main(
         for f in families
         if f != "ambiguous"
     ]
-    print(f"reference: {REFERENCE}; differences are over the seeds both played")
+    print(f"reference: {reference}; differences are over the seeds both played")
     for title, cell in [(f"{f} {m}", cells[f, m]) for f, m in sorted(cells)] + [
         (f"{f}, all", pooled([cells[c] for c in sorted(cells) if c[0] == f])) for f in families
     ]:
-        print("\n".join(lines_of(title, cell)))
-    draw(panels, figure)
+        print("\n".join(lines_of(title, cell, reference)))
+    if figure is not None:
+        draw(panels, figure)
 
 
 if __name__ == "__main__":

@@ -56,7 +56,7 @@ def make(name: str) -> Any:
 
 def play(task: Task, name: str, seed: int, film: Path | None = None) -> dict[str, float]:
     """One episode: the ego's return, and what its task counts."""
-    agent, names = make(name), zoo_names()
+    agent, names = make(name), zoo_names("development")
     policy = opponent(names[seed % len(names)])
     env = parallel_env(
         task=task, adversary_style=policy.style, full_observation=name == "oracle",
