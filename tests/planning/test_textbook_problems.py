@@ -165,6 +165,7 @@ def test_sensible_priors_forbid_what_cannot_pay():
         (1, 1, {0: -2.0, 1: -2.0, 2: 2.0}, [EAST]),  # rocks 0 and 1 are given up, rock 2 lies at (3, 1)
         (1, 2, {1: 2.0}, [SOUTH, WEST]),
         (0, 1, {}, [SAMPLE]),  # no check on the rock itself
+        (6, 0, dict.fromkeys(range(8), -2.0) | {6: 2.0}, [NORTH, WEST]),  # rock 6 at (5, 5); to leave is no way to it
         (4, 4, dict.fromkeys(range(8), -2.0), [EAST]),
     ],
 )
@@ -195,6 +196,8 @@ def test_the_guess_of_the_survey_policys_value():
     exact = 10 * 0.95**3 + 10 * 0.95**5
     assert rocks.survey_value(one_sure, 0.95, data) == pytest.approx(exact)
     assert rocks.survey_rollout(one_sure.copy(), 0, 0, 0, 90, 0.95, data, stream) == pytest.approx(exact)
+    blind = rock_sample_data(7, 8, half_distance=1e-3)
+    assert np.isfinite(rocks.survey_value(rover(0, 3), 0.95, blind))
     starts = RockBelief(data).sample(4000, np.random.default_rng(3))
     earned = np.mean([rocks.survey_rollout(state, 0, 0, 0, 90, 0.95, data, stream) for state in starts])
     assert (

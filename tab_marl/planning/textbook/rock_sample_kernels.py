@@ -23,6 +23,8 @@ COLLECTED = -1000.0
 """Log odds of a rock that was sampled."""
 FIRST = 2
 """Where the log odds begin in a state."""
+LEAST_EVIDENCE = 1e-3
+"""A sensor that says nothing at all takes a thousand readings to believe, and no policy waits for that."""
 
 
 @njit(cache=True)
@@ -221,7 +223,8 @@ def survey_value(state, discount, data):
         good = 1.0 / (1.0 + math.exp(-odds))
         checks = 0
         if odds < data.trust and way > 0:
-            checks = math.ceil((data.trust - odds) / data.evidence[cell * data.rocks + nearest])
+            evidence = max(data.evidence[cell * data.rocks + nearest], LEAST_EVIDENCE)
+            checks = math.ceil((data.trust - odds) / evidence)
         weight *= discount**checks
         total += weight * good * 10.0 * discount**way
         # With the chance that it is bad, nobody goes there.
@@ -251,7 +254,8 @@ def preferred(state, action, observation, depth, data, values, counts):
         elif state[FIRST + nearest] < data.trust:
             follows = a == CHECK + nearest
         else:
-            follows = a < SAMPLE and data.distance[np.int64(data.moves[cell * 4 + a]) * data.rocks + nearest] < way
+            after = np.int64(data.moves[cell * 4 + a]) if a < SAMPLE else np.int64(-1)
+            follows = after >= 0 and data.distance[after * data.rocks + nearest] < way
         counts[a] = data.pseudo_count
         values[a] = worth if follows else data.discount * worth
 
