@@ -76,13 +76,13 @@ def likelihood(before, action, state, observation, data):
 
 
 @njit(cache=True)
-def nearest_hopeful(state, cell, taken, data):
-    """(the nearest rock that may be good and is not in the bits `taken`, or -1; its distance in moves)."""
+def nearest_rock(state, cell, least_odds, taken, data):
+    """(the nearest rock with log odds above `least_odds` and not in the bits `taken`, or -1; its distance in moves)."""
     nearest = -1
     way = data.size * data.size
     for rock in range(data.rocks):
         distance = data.distance[cell * data.rocks + rock]
-        if state[FIRST + rock] > data.hope and distance < way and not (taken >> rock) & 1:
+        if state[FIRST + rock] > least_odds and distance < way and not (taken >> rock) & 1:
             way = distance
             nearest = rock
     return nearest, way
@@ -100,7 +100,7 @@ def survey_rollout(state, action, observation, depth, max_depth, discount, data,
     weight = 1.0
     left = max_depth - depth
     while True:
-        nearest, way = nearest_hopeful(state, cell, np.int64(0), data)
+        nearest, way = nearest_rock(state, cell, data.hope, np.int64(0), data)
         if nearest < 0:
             break
         odds = state[FIRST + nearest]
@@ -140,14 +140,7 @@ def harvest_rollout(state, action, observation, depth, max_depth, discount, data
     weight = 1.0
     left = max_depth - depth
     while True:
-        nearest = -1
-        way = data.size * data.size
-        for rock in range(data.rocks):
-            if state[FIRST + rock] > 0.0 and not (taken >> rock) & 1:
-                distance = data.distance[cell * data.rocks + rock]
-                if distance < way:
-                    way = distance
-                    nearest = rock
+        nearest, way = nearest_rock(state, cell, 0.0, taken, data)
         if nearest < 0:
             break
         left -= way + 1
@@ -216,7 +209,7 @@ def survey_value(state, discount, data):
     total = 0.0
     weight = 1.0
     while True:
-        nearest, way = nearest_hopeful(state, cell, taken, data)
+        nearest, way = nearest_rock(state, cell, data.hope, taken, data)
         if nearest < 0:
             break
         odds = state[FIRST + nearest]
@@ -242,7 +235,7 @@ def preferred(state, action, observation, depth, data, values, counts):
     """
     sensible(state, action, observation, depth, data, values, counts)
     cell = np.int64(state[0])
-    nearest, way = nearest_hopeful(state, cell, np.int64(0), data)
+    nearest, way = nearest_rock(state, cell, data.hope, np.int64(0), data)
     worth = survey_value(state, data.discount, data)
     for a in range(CHECK + data.rocks):
         if counts[a] < 0:
