@@ -57,12 +57,12 @@ def lines_of(title: str, cell: Cell, against: str) -> list[str]:
     """The table of one cell."""
     names = " ".join(f"{name:>6}" for name in ("StI", "ms", "belief", "paths", "values", "tree"))
     differences = f"{'ATCR - reference, points':>31} {'StI - reference':>29}"
-    lines = [title, f"  {'variant':<28} {'n':>4} {'ATCR % [95 %]':>19} {names} {differences}"]
+    lines = [title, f"  {'variant':<32} {'n':>4} {'ATCR % [95 %]':>19} {names} {differences}"]
     reference = cell.get(against, {})
     for variant, rows in cell.items():
         atcr, spent = share(column(rows, "completed")), milliseconds(rows)
         text = (
-            f"  {variant:<28} {len(rows):>4} {100 * atcr.value:>6.1f} [{100 * atcr.low:>4.1f}, {100 * atcr.high:>4.1f}] "
+            f"  {variant:<32} {len(rows):>4} {100 * atcr.value:>6.1f} [{100 * atcr.low:>4.1f}, {100 * atcr.high:>4.1f}] "
             f"{column(rows, 'physics_steps').mean():>6.0f} {spent.sum():>6.1f} "
             + " ".join(f"{part:>6.1f}" for part in spent)
         )
