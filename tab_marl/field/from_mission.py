@@ -142,13 +142,12 @@ def _motion(
                 f"{len(steps)} (one per speed in metres per tick: {steps}) over the map's {grid.cells} cells"
             )
         return motion, which
+    # In space a body moves any way it likes: it turns within a tick.
+    rate = processes.TYPICAL_TURN if isinstance(world, Volume) else world.adversary.max_turn_rate * world.step_seconds
     if options.reference == "run_and_tumble":
-        return processes.run_and_tumble(grid, steps, options.headings, options.mean_run_metres), which
+        first_turn = rate if options.begins_at_rest and isinstance(world, Scenario) else None
+        return processes.run_and_tumble(grid, steps, options.headings, options.mean_run_metres, first_turn), which
     if options.reference == "drive_and_turn":
-        # In space a body moves any way it likes: it turns within a tick.
-        rate = (
-            processes.TYPICAL_TURN if isinstance(world, Volume) else world.adversary.max_turn_rate * world.step_seconds
-        )
         rest = max(1.0, options.rest_seconds / world.step_seconds)
         return processes.drive_and_turn(grid, steps, rate, rest, options.headings, options.mean_run_metres), which
     if options.reference == "unicycle":

@@ -18,6 +18,8 @@ from scipy import sparse
 
 from tab_marl.field import kernels
 
+LEAST_SHARE = 1e-9
+"""Modes with less of the time are left for good: rounding gives them a little."""
 UNROLLED_WIDTH = 4
 """Row length for which the kernels are unrolled: a displacement rounded to cells has at most four ends."""
 
@@ -124,8 +126,11 @@ class Reference:
         return np.asarray(np.clip(shares, 0.0, None) / np.clip(shares, 0.0, None).sum())
 
     def first_mode_shares(self) -> NDArray[np.float64]:
-        """``[M]``: the distribution of the mode at tick 0, `mode_shares` among `first`."""
+        """``[M]``: the distribution of the mode at tick 0: `mode_shares` among `first`, or even among them where they only
+        occur at the beginning."""
         shares = self.mode_shares() * self.first
+        if shares.sum() < LEAST_SHARE:
+            shares = self.first.astype(np.float64)
         return np.asarray(shares / shares.sum())
 
     def matrix(self, r: int = 0) -> sparse.csr_array:

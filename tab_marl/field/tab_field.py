@@ -105,7 +105,7 @@ class TabField:
     @cached_property
     def branch_shares(self) -> dict[str, float]:
         """Place -> share of all counted visits at places that can stand for one another (1 where nothing can)."""
-        from tab_marl.field.constraints.tilt import alternatives
+        from tab_marl.field.constraints.goals import alternatives
 
         visits = self.tilt.visits(self.transitions)
         total = visits.copy()

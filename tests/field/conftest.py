@@ -78,7 +78,7 @@ def enumerate_trajectories(problem: FieldProblem, horizon: int, advance=None) ->
     default the problem's own tables.
     """
     motion = problem.reference
-    shares = motion.mode_shares()
+    shares = motion.first_mode_shares()
     matrices = [motion.matrix(r).toarray() for r in range(motion.count)]
     automaton = problem.automaton
     branches = int(automaton.branch.max(initial=-1)) + 1

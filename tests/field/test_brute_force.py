@@ -36,6 +36,7 @@ def problem_of(mission, scenario, reference, **options):
     settings = {
         "cell_metres": 1.0,
         "goal_marginals": False,
+        "goal_nearness": 0.0,
         "precision": "double",
         "marginal_tolerance": 1e-14,
     } | options

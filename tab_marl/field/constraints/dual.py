@@ -19,8 +19,9 @@ from scipy.special import logit
 from tab_marl.field.chain import ProductChain
 from tab_marl.field.constraints.contradiction import ContradictoryConstraints, explain
 from tab_marl.field.constraints.events import Completes, SoftConstraint, TimingPrior
+from tab_marl.field.constraints.goals import alternatives, goal_shares, reachable_places
 from tab_marl.field.constraints.report import ConstraintFit, FitReport
-from tab_marl.field.constraints.tilt import Tilt, alternatives, goal_shares, reachable_places, ticks_of
+from tab_marl.field.constraints.tilt import Tilt, ticks_of
 from tab_marl.field.infeasible import InfeasibleField
 from tab_marl.field.problem import COMPLETE, FieldProblem
 from tab_marl.field.tab_field import expected_transitions, start_log_partition
@@ -208,7 +209,7 @@ def _goal_marginals(built: _Builder) -> None:
         usable = usable[np.abs(visits[usable] - 1) > 1e-12] if len(usable) > 1 else usable
         if len(usable) > 1:
             each = [branch == b for b in usable]
-            shares = goal_shares(visits[usable], problem.options.goal_marginals)
+            shares = goal_shares(problem, usable, visits[usable])
             built.shares([f"visits {names[b]}" for b in usable], each, shares)
 
 

@@ -6,11 +6,12 @@ the automaton (exponential tilting); `fitting` finds them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tab_marl.field.constraints.goals import alternatives, goal_shares, reachable_places
 from tab_marl.field.problem import COMPLETE, FieldProblem
 
 Floats = NDArray[np.float64]
@@ -57,6 +58,8 @@ class Tilt:
     """Their wanted shares, sum 1."""
     free_visits: Floats | None = None
     """``[B]`` expected visits without the constraints; of the rough problem, where weights were fitted on one first."""
+    wanted_shares: list[Floats] = field(default_factory=list)
+    """Of the visits to each set of alternatives, what share each branch is to have."""
     fixed: Floats | None = None
     """``[Q, L]``: log of the factors, known from elsewhere (soft constraints, a file); then nothing is left to fit."""
 
@@ -152,6 +155,7 @@ class Tilt:
         self.branch_groups = groups
         if self.free_visits is None:
             self.free_visits = visits
+        self.wanted_shares = [goal_shares(self.problem, group, self.free_visits[group]) for group in groups]
         if len(self.log_tick):
             share = self.completions(flux)
             target = self._uniform_ticks(share > least * max(share.sum(), 1e-300))
@@ -169,25 +173,20 @@ class Tilt:
         feasible[~feasible.any(axis=1)] = possible
         return np.asarray(start[used] @ (feasible / feasible.sum(axis=1, keepdims=True)))
 
-    def branch_shares(self, group: NDArray[np.int64]) -> Floats:
-        """Of the visits to a set of alternatives, what share each is wanted to have."""
-        assert self.free_visits is not None, "drop_infeasible comes first"
-        return goal_shares(self.free_visits[group], self.problem.options.goal_marginals)
-
     def residual(self, flux: Floats) -> Floats:
         """Log-ratios target / present of every constrained expectation: the scaling step, zero when all are met."""
         parts = []
         visits = self.visits(flux)
-        for group in self.branch_groups:
+        for group, wanted in zip(self.branch_groups, self.wanted_shares, strict=True):
             present = np.maximum(visits[group], 1e-300)
-            parts.append(np.log(present.sum() * self.branch_shares(group)) - np.log(present))
+            parts.append(np.log(present.sum() * wanted) - np.log(present))
         if len(self.ticks):
             present = np.maximum(self.completions(flux)[self.ticks], 1e-300)
             parts.append(np.log(present.sum() * self.tick_shares) - np.log(present))
         if np.isfinite(self.log_failure):
             done = self.completed(flux)
-            wanted = self.problem.options.completion_probability
-            odds = np.log(wanted / (1 - wanted)) - np.log(max(done, 1e-300) / max(1 - done, 1e-300))
+            chance = self.problem.options.completion_probability
+            odds = np.log(chance / (1 - chance)) - np.log(max(done, 1e-300) / max(1 - done, 1e-300))
             parts.append(np.array([-odds]))
         return np.concatenate(parts) if parts else np.empty(0)
 
@@ -231,59 +230,3 @@ class Tilt:
             at += len(self.ticks)
         if np.isfinite(self.log_failure):
             self.log_failure = float(vector[at])
-
-
-def goal_shares(free_visits: Floats, equality: float) -> Floats:
-    """``[n]``: shares between equal ones (`equality` 1) and those that visits without the constraint have (0)."""
-    total = float(free_visits.sum())
-    free = free_visits / total if total > 0 else np.full(len(free_visits), 1 / len(free_visits))
-    return equality / len(free) + (1 - equality) * free
-
-
-def alternatives(problem: FieldProblem) -> list[NDArray[np.int64]]:
-    """Sets of branches that some location offers side by side, joined where they overlap."""
-    automaton = problem.automaton
-    occurring = np.unique(np.asarray(problem.labels))
-    parent = np.arange(int(automaton.branch.max(initial=-1)) + 1)
-
-    def root(b: int) -> int:
-        while parent[b] != b:
-            b = int(parent[b])
-        return b
-
-    offered = automaton.branch[:, occurring]
-    for location in np.unique(automaton.location):
-        side_by_side = np.unique(offered[automaton.location == location])
-        side_by_side = side_by_side[side_by_side >= 0]
-        for b in side_by_side[1:]:
-            for other in side_by_side[side_by_side < b]:
-                if not automaton.sides or automaton.sides[b] == automaton.sides[other]:
-                    parent[root(int(b))] = root(int(other))
-    roots = np.array([root(b) for b in range(len(parent))], dtype=np.int64)
-    groups = [np.flatnonzero(roots == r) for r in np.unique(roots)]
-    return [group for group in groups if len(group) > 1]
-
-
-def reachable_places(problem: FieldProblem, groups: list[NDArray[np.int64]]) -> list[NDArray[np.int64]]:
-    """Leave out places farther from every start than full speed covers until they may last be visited.
-
-    Rounding to cells lets the reference be faster than the robot with a small probability; equal mass would make it large.
-    """
-    grid, scenario = problem.grid, problem.scenario
-    if grid is None or scenario is None or not groups:
-        return groups
-    automaton, labels = problem.automaton, np.asarray(problem.labels)
-    started = np.asarray(problem.start) > 0
-    tick_metres = scenario.adversary.max_speed * scenario.step_seconds
-    kept = []
-    for group in groups:
-        reachable = []
-        for b in group:
-            states, symbols = np.nonzero(automaton.branch == b)
-            goal = np.flatnonzero(np.isin(labels, symbols))
-            latest = int(automaton.rank[states].max(initial=0))
-            metres = float(grid.distances(goal)[started].min()) if len(goal) else np.inf
-            reachable.append(metres <= latest * tick_metres + grid.cell_metres)
-        if sum(reachable) > 1:
-            kept.append(group[reachable])
-    return kept

@@ -9,13 +9,11 @@ from numpy.typing import ArrayLike
 
 from tab_marl.field.processes.isotropic import speeds_of
 from tab_marl.field.processes.stencils import Cells, rounded, rows_of
-from tab_marl.field.processes.tumble import TURNS_PER_RUN, compass
+from tab_marl.field.processes.tumble import TURNS_PER_RUN, TYPICAL_TURN, compass
 from tab_marl.field.reference import Reference, from_matrices
 
 STOPS_PER_RUN = 0.5
 RESTS_PER_STOP = 0.1
-TYPICAL_TURN = math.pi / 2
-"""Radians between one run's heading and the next's, on average, if all are as likely."""
 
 
 def drive_and_turn(

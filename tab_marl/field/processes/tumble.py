@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -17,23 +19,37 @@ TURNS_PER_RUN = 0.8
 REDRAWS_PER_RUN = 0.5
 REST_SHARE = 0.1
 
+TYPICAL_TURN = math.pi / 2
+"""Radians between one run's heading and the next's, on average, if all are as likely."""
+
 SPATIAL_HEADINGS = (6, 14, 26)
 """Directions in space: towards a cube's faces; and its corners; and its edges."""
 
 
 def run_and_tumble(
-    grid: Cells, metres_per_tick: ArrayLike, headings: int = 16, mean_run_metres: float = 0.5
+    grid: Cells,
+    metres_per_tick: ArrayLike,
+    headings: int = 16,
+    mean_run_metres: float = 0.5,
+    radians_per_tick: float | None = None,
 ) -> Reference:
     """Straight runs at full speed with small turns, and now and then a new heading or a rest; killed at walls.
 
+    Turns take no time, except before the first run if `radians_per_tick` is given.
+
     Args:
         metres_per_tick: one per reference (speed limits): ``[R]`` metres.
-        headings: how many directions, evenly around the circle; in space the next of SPATIAL_HEADINGS. The last mode
-            is rest.
+        headings: how many directions, evenly around the circle; in space the next of SPATIAL_HEADINGS. The mode after
+            them is rest.
         mean_run_metres: scale of the run length at the first (full) speed.
+        radians_per_tick: the largest turn in a tick; then motion begins in one more mode, at rest and facing anywhere, and
+            stays there as long as a quarter of a circle takes on average. None: it begins in full motion.
+    Raises:
+        ValueError: a number is not finite or not > 0.
     """
-    if not mean_run_metres > 0:
-        raise ValueError(f"mean_run_metres is {mean_run_metres}, must be > 0")
+    for name, value in (("mean_run_metres", mean_run_metres), ("radians_per_tick", radians_per_tick)):
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise ValueError(f"{name} is {value}, must be finite and > 0")
     speeds = speeds_of(metres_per_tick)
     direction, angles, beside = compass(grid, headings)
     headings = len(direction)
@@ -48,12 +64,21 @@ def run_and_tumble(
     np.fill_diagonal(mix, 1 - redraw - mix.sum(axis=1))
     anew = np.append(np.full(headings, (1 - REST_SHARE) / headings), REST_SHARE)
     mix += redraw * anew
-    rest = np.zeros(direction.shape[1])
+    leave = np.full(headings + 1, redraw)
+    still = np.zeros((1 if radians_per_tick is None else 2, direction.shape[1]))
+    angles = np.append(angles, np.full(len(still), np.nan))
+    first = None
+    if radians_per_tick is not None:
+        leave, anew = np.append(leave, min(1.0, radians_per_tick / TYPICAL_TURN)), np.append(anew, 0.0)
+        mix = np.pad(mix, (0, 1))
+        mix[-1] = leave[-1] * anew
+        mix[-1, -1] = 1 - leave[-1]
+        first = np.arange(len(leave)) == len(leave) - 1
     parts = []
     for speed in speeds:
-        moves = [*(speed * direction), rest]
+        moves = np.concatenate([speed * direction, still])
         parts.append(rows_of(grid, [rounded(move, 1.0, grid.cell_metres, m) for m, move in enumerate(moves)]))
-    return from_matrices(parts, mix, np.append(angles, np.nan), np.full(headings + 1, redraw), anew)
+    return from_matrices(parts, mix, angles, leave, anew, first)
 
 
 def compass(grid: Cells, headings: int) -> tuple[Floats, Floats, Floats]:
