@@ -74,6 +74,16 @@ VARIANTS: dict[str, Variant] = {
     "tree, no detours": pursuing("TAB-POMCP", detours=0),
     "tree, nearer goals likelier": predicting(goal_marginals=0.0),
     "tree, nearer goals half as much": predicting(goal_marginals=0.5),
+    "tree, goals by distance": predicting(goal_nearness=1.5),
+    "tree, turning first": predicting(begins_at_rest=True),
+    "tree, both of these": predicting(goal_nearness=1.5, begins_at_rest=True),
+    "tree, both of these, 50 ms": Variant(
+        "TAB-POMCP",
+        PlannerOptions(
+            pursuit=PursuitOptions.for_milliseconds(50),
+            tab_field=FieldOptions(goal_nearness=1.5, begins_at_rest=True),
+        ),
+    ),
     "tree, timing prior": predicting(timing_prior=True),
     "tree, drive and turn": predicting(reference="drive_and_turn"),
     "tree, runs of 0.5 m": predicting(mean_run_metres=0.5),

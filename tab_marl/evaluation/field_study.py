@@ -65,6 +65,9 @@ def _fields() -> Iterator[tuple[str, FieldOptions]]:
         yield f"{name} + goals + timing", replace(motion, timing_prior=True)
     yield "unicycle + goals", FieldOptions(reference="unicycle")
     yield "tumble 0.5 m + goals", FieldOptions(reference="run_and_tumble", mean_run_metres=0.5)
+    yield "tumble + near goals", FieldOptions(goal_nearness=1.5)
+    yield "turn, tumble + goals", FieldOptions(begins_at_rest=True)
+    yield "turn, tumble + near goals", FieldOptions(goal_nearness=1.5, begins_at_rest=True)
     yield "drive 0.5 m + goals", replace(VARIED, mean_run_metres=0.5)
     yield "drive 2 m + goals", replace(VARIED, mean_run_metres=2.0)
 

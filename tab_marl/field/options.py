@@ -15,7 +15,7 @@ class FieldOptions:
 
     reference: Literal["drive_and_turn", "run_and_tumble", "walk", "paper_walk", "unicycle"] = "run_and_tumble"
     """`drive_and_turn`: straight runs, turns on the spot and rests; it begins at rest. `run_and_tumble`: turns take no
-    time, but the first. `walk`: memoryless, displacements up to full speed. `paper_walk`: memoryless, all cells within one tick's reach.
+    time. `walk`: memoryless, displacements up to full speed. `paper_walk`: memoryless, all cells within one tick's reach.
     `unicycle`: any speed and turn rate that the robot has, afresh each tick."""
     cell_metres: float | None = None
     """None: the finest of CELL_SIZES_METRES within `state_budget`."""
@@ -25,14 +25,16 @@ class FieldOptions:
     """Of run-and-tumble and drive-and-turn. 0.5 predicts slightly better, 1 intercepts sooner (docs/studies/field.md)."""
     rest_seconds: float = 10.0
     """How long a rest lasts on average, in drive-and-turn."""
-    begins_at_rest: bool = True
-    """Run-and-tumble begins facing anywhere and first turns on the spot; False: in full motion."""
+    begins_at_rest: bool = False
+    """Run-and-tumble begins facing anywhere and first turns on the spot, as drive-and-turn always does: predicts the first
+    seconds better (docs/studies/field.md). False: it begins in full motion."""
     goal_marginals: float = 1.0
     """How far the shares of places that can stand for one another are set: 1, as `goal_nearness` says; 0, as the mission
     and the motion have it; between, that much of the one and the rest of the other."""
-    goal_nearness: float = 1.5
+    goal_nearness: float = 0.0
     """Where one of several places is to be visited first: a place whose shortest way is x times the nearest one's is visited
-    exp(-goal_nearness (x - 1)) times as often. 0, and wherever else places can stand for one another: all equally often."""
+    exp(-goal_nearness (x - 1)) times as often. 0, and wherever else places can stand for one another: all equally often.
+    1.5 is what learned adversaries do; expecting it intercepts no more of them (docs/studies/planner.md)."""
     timing_prior: bool = False
     """The completion tick is uniform over the feasible ticks."""
     completion_probability: float = 1.0

@@ -29,6 +29,7 @@ REFERENCES = {
     "paper_walk": {"reference": "paper_walk"},
     "walk": {"reference": "walk"},
     "run_and_tumble": {"reference": "run_and_tumble", "headings": 4, "mean_run_metres": 2.0},
+    "turning first": {"reference": "run_and_tumble", "headings": 4, "mean_run_metres": 2.0, "begins_at_rest": True},
 }
 
 
@@ -36,7 +37,6 @@ def problem_of(mission, scenario, reference, **options):
     settings = {
         "cell_metres": 1.0,
         "goal_marginals": False,
-        "goal_nearness": 0.0,
         "precision": "double",
         "marginal_tolerance": 1e-14,
     } | options
@@ -127,6 +127,25 @@ def test_goal_marginals(equality, name, reference, oracle, tiny_scenario):
     np.testing.assert_allclose(list(field.branch_visits.values()), target, atol=1e-12)
     agree(field, every, law)
     assert field.kl_to_reference == pytest.approx(every.divergence(law), abs=1e-11)
+
+
+@pytest.mark.parametrize("reference", REFERENCES)
+def test_nearer_goals_are_likelier(reference, oracle, tiny_scenario):
+    enumerate_trajectories, mission_runner = oracle
+    scenario = tiny_scenario()
+    places = ("Checkpoint A", "Checkpoint B", "Checkpoint C")
+    mission = Mission((Constraint("deadline", places, seconds=5),))
+    problem = problem_of(mission, scenario, reference, goal_marginals=0.8, goal_nearness=2.0)
+    every = enumerate_trajectories(problem, HORIZON, mission_runner(mission, scenario, problem.grid))
+    completed = every.completed_tick >= 0
+    before = every.tilted(np.where(completed, 0.0, -np.inf)) @ every.visits
+    grid, start = problem.grid, problem.start
+    metres = np.array([start @ grid.distances(np.flatnonzero(grid.inside(scenario.region(p)))) for p in places])
+    wanted = np.exp(-2.0 * (metres / metres.min() - 1))
+    target = 0.8 * wanted / wanted.sum() + 0.2 * before
+    assert np.ptp(target) > 0.1
+    law = every.fit(every.visits[:, 1:], target[1:], completed)
+    agree(solve(problem), every, law)
 
 
 @pytest.mark.parametrize("reference", REFERENCES)

@@ -126,8 +126,7 @@ def test_single_precision_agrees_with_double():
     mission = Mission((Constraint("deadline", ("Checkpoint A", "Checkpoint B"), seconds=18.0),))
     single, double = (
         solve(FieldProblem.from_mission(
-            mission, scenario,
-            FieldOptions(cell_metres=0.15, headings=8, precision=precision, marginal_tolerance=1e-5, goal_nearness=0.0),
+            mission, scenario, FieldOptions(cell_metres=0.15, headings=8, precision=precision, marginal_tolerance=1e-5)
         ))
         for precision in ("single", "double")
     )  # fmt: skip

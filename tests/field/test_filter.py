@@ -20,12 +20,7 @@ ROAM = Mission((Constraint("eventually", ("Checkpoint A", "Checkpoint B", "Check
 def problem(tiny_scenario):
     scenario = tiny_scenario(horizon_seconds=HORIZON, adversary_start=Box(0, 1, 3, 2))
     options = FieldOptions(
-        headings=4,
-        cell_metres=1.0,
-        precision="double",
-        mean_run_metres=2.0,
-        marginal_tolerance=1e-13,
-        begins_at_rest=False,
+        headings=4, cell_metres=1.0, precision="double", mean_run_metres=2.0, marginal_tolerance=1e-13
     )
     return FieldProblem.from_mission(ROAM, scenario, options)
 

@@ -103,7 +103,7 @@ MISSIONS = {
 )
 def test_the_primal_has_the_same_optimum_and_visits(name, options, tiny_scenario):
     settings = {"cell_metres": 1.0, "reference": "walk", "precision": "double", "marginal_tolerance": 1e-12}
-    settings |= {"goal_marginals": False, "goal_nearness": 0.0} | options
+    settings |= {"goal_marginals": False} | options
     problem = FieldProblem.from_mission(Mission(MISSIONS[name]), tiny_scenario(), FieldOptions(**settings))
     field = solve(problem)
     primal = solve_primal(problem, settings.get("completion_probability", 1.0), settings["goal_marginals"])

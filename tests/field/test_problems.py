@@ -281,9 +281,7 @@ def test_alternatives_of_joint_missions_do_not_mix() -> None:
     scenario = flat(width_metres=4.0, height_metres=4.0, regions=named, horizon_seconds=9.0)
     three = Mission((Constraint("eventually", ("place 0", "place 1", "place 2")),))
     two = Mission((Constraint("eventually", ("place 3", "place 4")),))
-    options = FieldOptions(
-        reference="walk", cell_metres=1.0, precision="double", marginal_tolerance=1e-9, goal_nearness=0.0
-    )
+    options = FieldOptions(reference="walk", cell_metres=1.0, precision="double", marginal_tolerance=1e-9)
     field = solve(FieldProblem.from_mission([three, two], scenario, options))
     visits = list(field.branch_visits.values())
     assert visits == pytest.approx([1 / 3] * 3 + [1 / 2] * 2, abs=1e-6)

@@ -36,7 +36,7 @@ REFERENCES = {
 
 def make(mission, scenario, reference, constraints=(), **options):
     settings = {
-        "cell_metres": 1.0, "goal_marginals": False, "goal_nearness": 0.0, "precision": "double", "marginal_tolerance": 1e-13,
+        "cell_metres": 1.0, "goal_marginals": False, "precision": "double", "marginal_tolerance": 1e-13,
         "constraint_tolerance": 1e-13,
     }  # fmt: skip
     return FieldProblem.from_mission(
