@@ -11,13 +11,21 @@ import pytest
 from tab_marl.planning.cycle import play
 from tab_marl.planning.search.pomcp import Pomcp, PomcpOptions
 from tab_marl.planning.textbook import laser_tag as laser_tag_function
-from tab_marl.planning.textbook import light_dark_binned, light_dark_start, rock_sample
+from tab_marl.planning.textbook import (
+    light_dark,
+    light_dark_binned,
+    light_dark_start,
+    rock_sample,
+    tag,
+    tiger,
+)
 from tab_marl.planning.textbook import rock_sample_kernels as rocks
 from tab_marl.planning.textbook.chase_maps import EAST, NORTH, SOUTH, TAG, WEST
 from tab_marl.planning.textbook.laser_tag import LaserTagBelief, laser_tag_data, laser_tag_places
 from tab_marl.planning.textbook.laser_tag_kernels import SEES_TARGET, likelihood
 from tab_marl.planning.textbook.light_dark import DECLARE, light_dark_data
 from tab_marl.planning.textbook.rock_sample import BAD, CHECK, GOOD, NOTHING, SAMPLE, RockBelief, rock_sample_data
+from tab_marl.world.scenario import UnknownName
 
 heavy = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="takes hours interpreted")
 
@@ -315,3 +323,14 @@ def test_the_initial_belief_of_light_dark_is_uniform():
     start = light_dark_start(5000, np.random.default_rng(0))
     assert (start.min(), start.max()) == (-30, 30)
     assert start.shape == (5000, 1)
+
+
+@pytest.mark.parametrize("problem", [tiger, tag, rock_sample, laser_tag_function, light_dark, light_dark_binned])
+def test_an_unknown_rollout_names_the_nearest(problem):
+    with pytest.raises(UnknownName, match=r"no rollout of .* named"):
+        problem(rollout="uniformly")
+
+
+def test_an_unknown_prior_names_the_nearest():
+    with pytest.raises(UnknownName, match="no prior of RockSample named 'prefered': did you mean 'preferred'"):
+        rock_sample(prior="prefered")

@@ -23,6 +23,7 @@ from tab_marl.planning.model import CompiledModel
 from tab_marl.planning.textbook import chase_maps
 from tab_marl.planning.textbook import laser_tag_kernels as kernels
 from tab_marl.planning.textbook.chase_maps import TAG, Place
+from tab_marl.planning.textbook.choices import chosen
 
 _COMPASS = [(0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, -1), (-1, 1)]
 _NOISE = 2.5
@@ -104,13 +105,13 @@ def laser_tag(
     now on; "engine" is uniformly random.
     """
     data = laser_tag_data(laser_tag_places(seed)) if data is None else data
-    function = {"history": kernels.history_rollout, "seen": kernels.seen_leaf, "engine": None}[rollout]
+    rollouts = {"history": kernels.history_rollout, "seen": kernels.seen_leaf, "engine": None}
     return CompiledModel(
         kernels.step,
         5,
         2,
         data,
-        rollout=function,
+        rollout=chosen("rollout of LaserTag", rollout, rollouts),
         action_names=chase_maps.ACTION_NAMES,
         upper=kernels.seen_value,
     )

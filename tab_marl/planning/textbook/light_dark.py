@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 
 from tab_marl.planning.model import CompiledModel, ContinuousModel
 from tab_marl.planning.textbook import light_dark_kernels as kernels
+from tab_marl.planning.textbook.choices import chosen
 
 DECLARE = 2
+ROLLOUTS = {"full view": kernels.full_view_value, "random": kernels.random_walk}
 """The number of the action that ends it."""
 DISCOUNT = 0.95
 
@@ -78,7 +80,7 @@ def light_dark(
 
     `rollout`: "full view" is the best return if the position were known from now on, "random" walks at random.
     """
-    function = {"full view": kernels.full_view_value, "random": kernels.random_walk}[rollout]
+    function = chosen("rollout of light-dark", rollout, ROLLOUTS)
     data = light_dark_data() if data is None else data
     names = action_names(data.moves)
     return ContinuousModel(kernels.step, kernels.likelihood, 5, 1, 1, data, rollout=function, action_names=names)
@@ -88,7 +90,7 @@ def light_dark_binned(
     bin_width: float = 0.05, rollout: Literal["full view", "random"] = "full view", data: LightDarkData | None = None
 ) -> CompiledModel:
     """Light-dark whose readings are rounded to bins: the discrete problem that POMCP and DESPOT can be given."""
-    function = {"full view": kernels.full_view_value, "random": kernels.random_walk}[rollout]
+    function = chosen("rollout of light-dark", rollout, ROLLOUTS)
     data = light_dark_data(bin_width=bin_width) if data is None else data
     return CompiledModel(kernels.binned_step, 5, 1, data, rollout=function, action_names=action_names(data.moves))
 

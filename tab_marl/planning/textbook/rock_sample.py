@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from tab_marl.planning.model import CompiledModel
 from tab_marl.planning.textbook import rock_sample_kernels as kernels
 from tab_marl.planning.textbook.chase_maps import Place
+from tab_marl.planning.textbook.choices import chosen
 
 SAMPLE, CHECK = kernels.SAMPLE, kernels.CHECK
 """The number of "sample", and of "check rock 0"; rock k is CHECK + k."""
@@ -134,12 +135,12 @@ def rock_sample(
     the survey policy is left only for what shows itself to be better (preferred actions: Silver and Veness, section 5).
     """
     data = rock_sample_data(size, rocks) if data is None else data
-    function = {
+    rollouts = {
         "survey": kernels.survey_rollout,
         "harvest": kernels.harvest_rollout,
         "legal": kernels.legal_rollout,
         "engine": None,
-    }[rollout]
+    }
     priors: dict[str, Callable[..., None] | None] = {
         "preferred": kernels.preferred,
         "sensible": kernels.sensible,
@@ -150,8 +151,8 @@ def rock_sample(
         5 + data.rocks,
         2 + data.rocks,
         data,
-        rollout=function,
-        prior=priors[prior],
+        rollout=chosen("rollout of RockSample", rollout, rollouts),
+        prior=chosen("prior of RockSample", prior, priors),
         action_names=("north", "east", "south", "west", "sample", *(f"check {k}" for k in range(data.rocks))),
         upper=kernels.upper,
     )

@@ -12,6 +12,7 @@ from tab_marl.planning.model import CompiledModel
 from tab_marl.planning.textbook import chase_maps
 from tab_marl.planning.textbook import tag_kernels as kernels
 from tab_marl.planning.textbook.chase_maps import TAG
+from tab_marl.planning.textbook.choices import chosen
 
 SEES_TARGET = kernels.SEES_TARGET
 PLACES = [(x, y) for y in range(2) for x in range(10)] + [(x, y) for y in range(2, 5) for x in range(5, 8)]
@@ -69,13 +70,13 @@ def tag(rollout: Literal["history", "uniform", "engine"] = "history", preferred:
     `rollout`: "history" tags when on the target and does not double back; "uniform" takes all actions alike, in one compiled
     call; "engine" leaves it to the engine's own random rollout. `preferred` starts such actions with 10 simulations.
     """
-    function = {"history": kernels.history_rollout, "uniform": kernels.uniform_rollout, "engine": None}[rollout]
+    rollouts = {"history": kernels.history_rollout, "uniform": kernels.uniform_rollout, "engine": None}
     return CompiledModel(
         kernels.step,
         5,
         2,
         tag_data(),
-        rollout=function,
+        rollout=chosen("rollout of Tag", rollout, rollouts),
         prior=kernels.preferred if preferred else None,
         action_names=chase_maps.ACTION_NAMES,
         upper=kernels.seen_value,

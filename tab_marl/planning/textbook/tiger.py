@@ -10,6 +10,7 @@ import numpy as np
 from tab_marl.planning.model import CompiledModel
 from tab_marl.planning.tables import table_model
 from tab_marl.planning.textbook import tiger_kernels as kernels
+from tab_marl.planning.textbook.choices import chosen
 
 LISTEN, OPEN_LEFT, OPEN_RIGHT = 0, 1, 2
 HEAR_LEFT, HEAR_RIGHT = 0, 1
@@ -30,4 +31,5 @@ def tiger(accuracy: float = 0.85, rollout: Literal["patient", "engine"] = "patie
         reward=[[-1, -1], [-100, 10], [10, -100]],
         action_names=("listen", "open left", "open right"),
     )
-    return replace(model, rollout=kernels.patient_rollout) if rollout == "patient" else model
+    rollouts = {"patient": kernels.patient_rollout, "engine": None}
+    return replace(model, rollout=chosen("rollout of Tiger", rollout, rollouts))
