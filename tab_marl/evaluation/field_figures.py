@@ -13,7 +13,8 @@ from tab_marl.evaluation.statistics import share
 
 CEILING = "knows the population"
 SHOWN = {
-    "walk": "#9aa3ad", "tumble + goals": "#7fa7d6", "tumble 0.5 m + goals": "#1f6feb", "drive + goals": "#c98a2b",
+    "walk": "#9aa3ad", "tumble + goals": "#7fa7d6", "tumble 0.5 m + goals": "#1f6feb",
+    "turn, tumble + goals": "#14407f", "drive + goals": "#c98a2b",
     "particles": "#5fb0a5", "marginal kernel": "#b07cc6", "FP": "#d1495b", "MLE": "#8d6e63", CEILING: "#111111",
 }  # fmt: skip
 """Models in the figure, all scored on every task, and their colours."""
