@@ -46,9 +46,10 @@ def pursuing(planner: str, milliseconds: float = 20, **changes: Any) -> Variant:
     return Variant(planner, PlannerOptions(pursuit=PursuitOptions.for_milliseconds(milliseconds, **changes)))
 
 
-def predicting(**changes: Any) -> Variant:
+def predicting(milliseconds: float = 20, **changes: Any) -> Variant:
     """TAB-POMCP with another field."""
-    return Variant("TAB-POMCP", PlannerOptions(tab_field=FieldOptions(**changes)))
+    pursuit = PursuitOptions.for_milliseconds(milliseconds)
+    return Variant("TAB-POMCP", PlannerOptions(pursuit=pursuit, tab_field=FieldOptions(**changes)))
 
 
 OPEN_LOOP = {"method": "routes", "detours": 0, "paths": 200, "screened": 1000, "keep_bonus": 0.0}
@@ -77,13 +78,8 @@ VARIANTS: dict[str, Variant] = {
     "tree, goals by distance": predicting(goal_nearness=1.5),
     "tree, turning first": predicting(begins_at_rest=True),
     "tree, both of these": predicting(goal_nearness=1.5, begins_at_rest=True),
-    "tree, both of these, 50 ms": Variant(
-        "TAB-POMCP",
-        PlannerOptions(
-            pursuit=PursuitOptions.for_milliseconds(50),
-            tab_field=FieldOptions(goal_nearness=1.5, begins_at_rest=True),
-        ),
-    ),
+    "tree, goals by distance, 50 ms": predicting(50, goal_nearness=1.5),
+    "tree, both of these, 50 ms": predicting(50, goal_nearness=1.5, begins_at_rest=True),
     "tree, timing prior": predicting(timing_prior=True),
     "tree, drive and turn": predicting(reference="drive_and_turn"),
     "tree, runs of 0.5 m": predicting(mean_run_metres=0.5),

@@ -22,7 +22,7 @@ class FieldOptions:
     headings: int = 16
     """Directions, where the reference has any (in space 6, 14 or 26); halved when even the coarsest cells exceed the budget."""
     mean_run_metres: float = 1.0
-    """Of run-and-tumble and drive-and-turn. 0.5 predicts slightly better, 1 intercepts sooner (docs/studies/field.md)."""
+    """Of run-and-tumble and drive-and-turn. 0.5 predicts better, neither intercepts better (docs/studies/field.md)."""
     rest_seconds: float = 10.0
     """How long a rest lasts on average, in drive-and-turn."""
     begins_at_rest: bool = False
