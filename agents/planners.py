@@ -35,6 +35,7 @@ from tab_marl.planning.models.field_model import FieldModel
 from tab_marl.planning.models.guarded import EvidentModel, Guarded
 from tab_marl.planning.models.interface import AdversaryModel, Sighting, TickObservation
 from tab_marl.planning.models.mission_map import MissionMap
+from tab_marl.planning.models.mixture import Mixture
 from tab_marl.planning.models.pool import PoolOptions, TrajectoryPool
 from tab_marl.planning.models.shortest_path import ShortestPath, ShortestPathOptions
 from tab_marl.planning.models.walker import MoveCounts, Walker
@@ -70,6 +71,9 @@ class PlannerOptions:
     """Of S-POMCP and MLE-POMCP."""
     rollouts: Rollouts | None = None
     """Of population-POMCP; None: every policy that ships with the package, those of the final table among them."""
+    precedents: Rollouts | None = None
+    """Of TAB-POMCP: how others with such missions have driven, an even match for the field until observations tell which
+    foresees better. None: the mission alone, as in the paper and in all tables."""
     moves: MoveCounts | None = None
     """What MLE-POMCP has counted before; None: the development policies' moves (`tab_marl.agents.pretraining`)."""
     carries_moves: bool = False
@@ -211,13 +215,19 @@ class PlannerAgent:
                 MissionMap.build(scenario, mission), self.moves, feasible=True, learns=True, particles=options.particles
             )
         if self.name == "population-POMCP":
-            positions, completed = (options.rollouts or zoo_rollouts)(task, rng)
-            pool = TrajectoryPool(scenario, positions, completed, options.pool)
-            pool.wander_after_completion(MissionMap.build(scenario, mission), rng)
-            return pool
+            return self._pool(options.rollouts or zoo_rollouts, task, rng)
         memory = options.memory
         solved = None if memory is None else memory.field(scenario, mission, options.tab_field)
-        return FieldModel(scenario, mission, options.tab_field, solved)
+        model = FieldModel(scenario, mission, options.tab_field, solved)
+        if self.name == "TAB-POMCP" and options.precedents is not None:
+            return Mixture([model, self._pool(options.precedents, task, rng)], [0.5, 0.5])
+        return model
+
+    def _pool(self, rollouts: Rollouts, task: Task, rng: np.random.Generator) -> TrajectoryPool:
+        positions, completed = rollouts(task, rng)
+        pool = TrajectoryPool(task.scenario, positions, completed, self.options.pool)
+        pool.wander_after_completion(MissionMap.build(task.scenario, task.mission), rng)
+        return pool
 
     def _update(self, view: EgoView) -> None:
         """Hand the model what happened since the last tick."""

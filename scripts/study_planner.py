@@ -39,7 +39,9 @@ class Variant:
     planner: str
     options: PlannerOptions = field(default_factory=PlannerOptions)
     knows: Literal["those played", "the others"] = "those played"
-    """Whose paths population-POMCP draws: of the split that is played, or of the other one."""
+    """Whose paths population-POMCP draws, and are precedents: of the split that is played, or of the other one."""
+    precedents: bool = False
+    """Whether TAB-POMCP is shown them as well."""
 
 
 def pursuing(planner: str, milliseconds: float = 20, **changes: Any) -> Variant:
@@ -63,6 +65,8 @@ VARIANTS: dict[str, Variant] = {
     "population 50 ms": pursuing("population-POMCP", 50),
     "population of others": replace(pursuing("population-POMCP"), knows="the others"),
     "population of others 50 ms": replace(pursuing("population-POMCP", 50), knows="the others"),
+    "precedents of others": replace(pursuing("TAB-POMCP"), knows="the others", precedents=True),
+    "precedents of others 50 ms": replace(pursuing("TAB-POMCP", 50), knows="the others", precedents=True),
     "oracle": pursuing("oracle"),
     "S-POMCP": pursuing("S-POMCP"),
     "FP-POMCP": pursuing("FP-POMCP"),
@@ -98,7 +102,8 @@ def play(
     names = zoo_names(split)
     other: Split = "final" if split == "development" else "development"
     known = population(names if variant.knows == "those played" else zoo_names(other))
-    agent = PlannerAgent(variant.planner, replace(variant.options, rollouts=known))
+    shown = known if variant.precedents else None
+    agent = PlannerAgent(variant.planner, replace(variant.options, rollouts=known, precedents=shown))
     policy = opponent(names[unit.seed % len(names)])
     row = run_episode(
         task, agent, policy, episode_seed, False, unit.seed, planner_seed, max_steps=11 if warm else None

@@ -13,6 +13,7 @@ from tab_marl.envs.ego_observation import observe_ego
 from tab_marl.envs.physics import Motion
 from tab_marl.mission.model import Constraint, Mission
 from tab_marl.mission.tasks import Task, sample_task
+from tab_marl.planning.models.mixture import Mixture
 from tab_marl.planning.pursuit.decide import PursuitOptions
 from tab_marl.world.kernels import steer, unicycle_step
 from tab_marl.world.regions import Disc
@@ -166,6 +167,22 @@ def test_goal_places_are_waypoints_for_every_mission_type(mission: str) -> None:
     agent.reset(task, np.random.default_rng(0))
     for place in places:
         assert np.hypot(*(agent.routes.waypoints - place).T).min() < 0.2  # type: ignore[attr-defined]
+
+
+def test_tab_pomcp_can_be_shown_precedents() -> None:
+    """The belief is then partly theirs."""
+    plain, shown = (
+        make_planner("TAB-POMCP", SMALL),
+        make_planner("TAB-POMCP", replace(SMALL, precedents=straight_lines)),
+    )
+    play(plain, WAIT, seed=3, seconds=3.0)
+    play(shown, WAIT, seed=3, seconds=3.0)
+    model = shown._model
+    assert isinstance(model, Mixture) and plain._model is not None
+    pool = model.models[1].occupancy()[1]
+    field, mixed = plain.belief_image(), shown.belief_image()
+    assert 0 < model.weights[1] < 1 and np.nansum(mixed) == pytest.approx(1.0)
+    assert np.nanmax(np.abs(mixed - field)) > 1e-4 and pool.sum() == pytest.approx(1.0)
 
 
 def test_unknown_planners_are_refused_with_the_nearest_name() -> None:

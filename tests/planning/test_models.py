@@ -13,6 +13,7 @@ from tab_marl.planning.models.field_model import FieldModel
 from tab_marl.planning.models.guarded import Guarded
 from tab_marl.planning.models.interface import AdversaryModel, Sighting, TickObservation
 from tab_marl.planning.models.mission_map import MissionMap
+from tab_marl.planning.models.mixture import Mixture
 from tab_marl.planning.models.pool import TrajectoryPool
 from tab_marl.planning.models.shortest_path import ShortestPath, ShortestPathOptions, goal_choices
 from tab_marl.planning.models.walker import MoveCounts, Walker
@@ -53,6 +54,8 @@ def make(name: str, mission: Mission = ANY) -> AdversaryModel:
         return ShortestPath(OPEN, mission)
     if name == "TAB":
         return FieldModel(OPEN, mission, COARSE)
+    if name == "mixture":
+        return Mixture([FieldModel(OPEN, mission, COARSE), make("pool")], [0.5, 0.5])  # type: ignore[list-item]
     rng = RNG(5)
     ends = np.array([(0.5, 2.5), (2.5, 2.5)])[rng.integers(2, size=100)]
     share = np.minimum(np.arange(81) / 25, 1.0)[None, :, None]
@@ -60,7 +63,7 @@ def make(name: str, mission: Mission = ANY) -> AdversaryModel:
     return TrajectoryPool(OPEN, start + share * (ends[:, None] - start), np.full(100, 23, dtype=np.int32))
 
 
-MODELS = ("S", "FP", "MLE", "TAB", "pool")
+MODELS = ("S", "FP", "MLE", "TAB", "pool", "mixture")
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -79,7 +82,7 @@ def test_every_model_follows_sightings_and_never_breaks(name: str) -> None:
         grid, occupancy = model.occupancy()
         assert occupancy.shape == (grid.cells,)
         assert occupancy.min() >= 0 and occupancy.sum() == pytest.approx(1.0)
-        if tick in (14, 15, 40) and name != "pool":
+        if tick in (14, 15, 40) and name not in ("pool", "mixture"):
             mean = occupancy @ grid.centres
             assert math.dist(mean, (sighting.x, sighting.y)) < 0.12
     paths = model.sample(50, 20, rng)
@@ -94,7 +97,7 @@ def test_no_sampled_adversary_outruns_the_robot(name: str) -> None:
     model.start(TickObservation(0, FAR), rng)
     steps = np.hypot(*np.moveaxis(np.diff(model.sample(60, 30, rng).positions, axis=1), -1, 0))
     # Cells of 0.1 m: single moves are rounded, the average is not.
-    assert steps.max() <= REACH + (0.12 if name == "TAB" else 1e-6)
+    assert steps.max() <= REACH + (0.12 if name in ("TAB", "mixture") else 1e-6)
     assert steps.mean() <= REACH * (1.05 if name == "TAB" else 1.0) + 1e-6
 
 
