@@ -26,7 +26,7 @@ class FieldOptions:
     rest_seconds: float = 10.0
     """How long a rest lasts on average, in drive-and-turn."""
     begins_at_rest: bool = False
-    """Run-and-tumble begins facing anywhere and first turns on the spot, as drive-and-turn always does: predicts the first
+    """In the plane, run-and-tumble begins facing anywhere and first turns on the spot, as drive-and-turn always does: predicts the first
     seconds better (docs/studies/field.md). False: it begins in full motion."""
     goal_marginals: float = 1.0
     """How far the shares of places that can stand for one another are set: 1, as `goal_nearness` says; 0, as the mission
@@ -34,7 +34,7 @@ class FieldOptions:
     goal_nearness: float = 0.0
     """Where one of several places is to be visited first: a place whose shortest way is x times the nearest one's is visited
     exp(-goal_nearness (x - 1)) times as often. 0, and wherever else places can stand for one another: all equally often.
-    1.5 is what learned adversaries do; expecting it intercepts no more of them (docs/studies/planner.md)."""
+    1.5 is nearest to what learned adversaries do; expecting it intercepts no more of them (docs/studies/planner.md)."""
     timing_prior: bool = False
     """The completion tick is uniform over the feasible ticks."""
     completion_probability: float = 1.0

@@ -179,10 +179,9 @@ def test_tab_pomcp_can_be_shown_precedents() -> None:
     play(shown, WAIT, seed=3, seconds=3.0)
     model = shown._model
     assert isinstance(model, Mixture) and plain._model is not None
-    pool = model.models[1].occupancy()[1]
     field, mixed = plain.belief_image(), shown.belief_image()
     assert 0 < model.weights[1] < 1 and np.nansum(mixed) == pytest.approx(1.0)
-    assert np.nanmax(np.abs(mixed - field)) > 1e-4 and pool.sum() == pytest.approx(1.0)
+    assert np.nanmax(np.abs(mixed - field)) > 1e-4
 
 
 def test_unknown_planners_are_refused_with_the_nearest_name() -> None:

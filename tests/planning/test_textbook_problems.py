@@ -11,14 +11,7 @@ import pytest
 from tab_marl.planning.cycle import play
 from tab_marl.planning.search.pomcp import Pomcp, PomcpOptions
 from tab_marl.planning.textbook import laser_tag as laser_tag_function
-from tab_marl.planning.textbook import (
-    light_dark,
-    light_dark_binned,
-    light_dark_start,
-    rock_sample,
-    tag,
-    tiger,
-)
+from tab_marl.planning.textbook import light_dark, light_dark_binned, light_dark_start, rock_sample, tag, tiger
 from tab_marl.planning.textbook import rock_sample_kernels as rocks
 from tab_marl.planning.textbook.chase_maps import EAST, NORTH, SOUTH, TAG, WEST
 from tab_marl.planning.textbook.laser_tag import LaserTagBelief, laser_tag_data, laser_tag_places

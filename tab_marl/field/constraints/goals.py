@@ -39,17 +39,19 @@ def _can_be_first(problem: FieldProblem, group: NDArray[np.int64]) -> bool:
 def branch_metres(problem: FieldProblem, group: NDArray[np.int64]) -> Floats:
     """``[n]``: the shortest way from the start to where each branch is taken, the mean over start cells and at least a
     cell; inf where there is none, or no map."""
-    grid, automaton, labels = problem.grid, problem.automaton, np.asarray(problem.labels)
-    metres = np.full(len(group), np.inf)
-    if grid is None:
-        return metres
+    if problem.grid is None:
+        return np.full(len(group), np.inf)
     start = np.asarray(problem.start)
-    for i, b in enumerate(group):
-        goal = np.flatnonzero(np.isin(labels, np.nonzero(automaton.branch == b)[1]))
-        if len(goal):
-            away = grid.distances(goal)[start > 0]
-            metres[i] = max(float(start[start > 0] @ away), grid.cell_metres)
-    return metres
+    mean = np.array([start[start > 0] @ _ways(problem, b) for b in group])
+    return np.maximum(mean, problem.grid.cell_metres)
+
+
+def _ways(problem: FieldProblem, b: int) -> Floats:
+    """Metres of the shortest way from each start cell to where a branch is taken; inf if there is none."""
+    assert problem.grid is not None
+    started = np.asarray(problem.start) > 0
+    goal = np.flatnonzero(np.isin(np.asarray(problem.labels), np.nonzero(problem.automaton.branch == b)[1]))
+    return problem.grid.distances(goal)[started] if len(goal) else np.full(int(started.sum()), np.inf)
 
 
 def alternatives(problem: FieldProblem) -> list[NDArray[np.int64]]:
@@ -84,18 +86,14 @@ def reachable_places(problem: FieldProblem, groups: list[NDArray[np.int64]]) -> 
     grid, scenario = problem.grid, problem.scenario
     if grid is None or scenario is None or not groups:
         return groups
-    automaton, labels = problem.automaton, np.asarray(problem.labels)
-    started = np.asarray(problem.start) > 0
+    automaton = problem.automaton
     tick_metres = scenario.adversary.max_speed * scenario.step_seconds
     kept = []
     for group in groups:
         reachable = []
         for b in group:
-            states, symbols = np.nonzero(automaton.branch == b)
-            goal = np.flatnonzero(np.isin(labels, symbols))
-            latest = int(automaton.rank[states].max(initial=0))
-            metres = float(grid.distances(goal)[started].min()) if len(goal) else np.inf
-            reachable.append(metres <= latest * tick_metres + grid.cell_metres)
+            latest = int(automaton.rank[np.nonzero(automaton.branch == b)[0]].max(initial=0))
+            reachable.append(_ways(problem, b).min() <= latest * tick_metres + grid.cell_metres)
         if sum(reachable) > 1:
             kept.append(group[reachable])
     return kept

@@ -20,9 +20,9 @@ from tab_marl.planning.textbook import light_dark_kernels as kernels
 from tab_marl.planning.textbook.choices import chosen
 
 DECLARE = 2
-ROLLOUTS = {"full view": kernels.full_view_value, "random": kernels.random_walk}
 """The number of the action that ends it."""
 DISCOUNT = 0.95
+ROLLOUTS = {"full view": kernels.full_view_value, "random": kernels.random_walk}
 
 
 class LightDarkData(NamedTuple):
