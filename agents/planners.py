@@ -1,18 +1,19 @@
 """The planners as agents: environment observations in, controls out.
 
-Seven names, one planner: they differ in nothing but the adversary model (`tab_marl.planning.models`).
+Eight names, one planner: they differ in nothing but the adversary model (`tab_marl.planning.models`).
 
-==================  ====================================================================================================
-name                adversary model
-==================  ====================================================================================================
-S-POMCP             uniform random moves within the speed limit
-FP-POMCP            the shortest path to the mission's objectives at full speed
-MLE-POMCP           moves counted from sightings of the development policies and of this episode, kept feasible
-TAB-POMCP           the TAB-Field's bridge kernel
-oracle              the TAB-Field's, and the adversary is always seen (environment option `full_observation`)
-population-POMCP    trajectories of the very policies that may be played, weighted by what was seen: a ceiling
-random              none: drives to random waypoints
-==================  ====================================================================================================
+====================  ==================================================================================================
+name                  adversary model
+====================  ==================================================================================================
+S-POMCP               uniform random moves within the speed limit
+FP-POMCP              the shortest path to the mission's objectives at full speed
+MLE-POMCP             moves counted from sightings of the development policies and of this episode, kept feasible
+TAB-POMCP             the TAB-Field's bridge kernel
+TAB-POMCP+precedents  the same, or as other policies (those for development) drove on this task: whichever foresees better
+oracle                the TAB-Field's, and the adversary is always seen (environment option `full_observation`)
+population-POMCP      trajectories of the very policies that may be played, weighted by what was seen: a ceiling
+random                none: drives to random waypoints
+====================  ==================================================================================================
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tab_marl.agents.planner_memory import PlannerMemory
+from tab_marl.agents.policies.cards import Split
 from tab_marl.agents.pretraining import pretrained
 from tab_marl.envs.ego_observation import EgoView, parse_ego_observation
 from tab_marl.field.problem import FieldOptions
@@ -44,7 +46,8 @@ from tab_marl.planning.pursuit.routes import RouteMap, RouteOptions
 from tab_marl.planning.pursuit.scenarios import ReuseOptions, ScenarioSet
 from tab_marl.world.scenario import UnknownName
 
-PLANNERS = ("S-POMCP", "FP-POMCP", "MLE-POMCP", "TAB-POMCP", "oracle", "population-POMCP", "random")
+PRECEDENTS = "TAB-POMCP+precedents"
+PLANNERS = ("S-POMCP", "FP-POMCP", "MLE-POMCP", "TAB-POMCP", PRECEDENTS, "oracle", "population-POMCP", "random")
 
 GUARDS = tuple((name, 0.05) for name in ("FP-POMCP", "MLE-POMCP", "population-POMCP"))
 
@@ -62,7 +65,7 @@ class PlannerOptions:
     reuse: ReuseOptions = field(default_factory=ReuseOptions)
     routes: RouteOptions = field(default_factory=RouteOptions)
     tab_field: FieldOptions = field(default_factory=FieldOptions)
-    """Of TAB-POMCP and the oracle."""
+    """Of TAB-POMCP, with and without precedents, and of the oracle."""
     shortest_path: ShortestPathOptions = field(default_factory=ShortestPathOptions)
     pool: PoolOptions = field(default_factory=PoolOptions)
     guards: tuple[tuple[str, float], ...] = GUARDS
@@ -72,8 +75,8 @@ class PlannerOptions:
     rollouts: Rollouts | None = None
     """Of population-POMCP; None: every policy that ships with the package, those of the final table among them."""
     precedents: Rollouts | None = None
-    """Of TAB-POMCP: how others with such missions have driven, an even match for the field until observations tell which
-    foresees better. None: the mission alone, as in the paper and in all tables."""
+    """Of TAB-POMCP+precedents: how others with such missions have driven, an even match for the field until observations
+    tell which foresees better. None: the development policies that ship with the package."""
     moves: MoveCounts | None = None
     """What MLE-POMCP has counted before; None: the development policies' moves (`tab_marl.agents.pretraining`)."""
     carries_moves: bool = False
@@ -215,12 +218,13 @@ class PlannerAgent:
                 MissionMap.build(scenario, mission), self.moves, feasible=True, learns=True, particles=options.particles
             )
         if self.name == "population-POMCP":
-            return self._pool(options.rollouts or zoo_rollouts, task, rng)
+            return self._pool(options.rollouts or zoo_rollouts(), task, rng)
         memory = options.memory
         solved = None if memory is None else memory.field(scenario, mission, options.tab_field)
         model = FieldModel(scenario, mission, options.tab_field, solved)
-        if self.name == "TAB-POMCP" and options.precedents is not None:
-            return Mixture([model, self._pool(options.precedents, task, rng)], [0.5, 0.5])
+        if self.name == PRECEDENTS:
+            pool = self._pool(options.precedents or zoo_rollouts("development"), task, rng)
+            return Mixture([model, pool], [0.5, 0.5])
         return model
 
     def _pool(self, rollouts: Rollouts, task: Task, rng: np.random.Generator) -> TrajectoryPool:
@@ -310,12 +314,16 @@ def goal_places(task: Task) -> tuple[tuple[float, float], ...]:
     return tuple(dict.fromkeys([*(region.centre for region in regions), *own]))
 
 
-def zoo_rollouts(task: Task, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Trajectories of the shipped policies in this task, unopposed."""
-    from tab_marl.agents.measures import rollouts
-    from tab_marl.agents.policies.zoo import load_zoo
+def zoo_rollouts(split: Split | None = None) -> Rollouts:
+    """Of the shipped policies of a split (None: of both)."""
 
-    return rollouts.zoo_rollouts(load_zoo(), task, rng, ROLLOUTS_PER_POLICY)
+    def rollouts(task: Task, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+        from tab_marl.agents.measures.rollouts import zoo_rollouts
+        from tab_marl.agents.policies.zoo import load_zoo
+
+        return zoo_rollouts(load_zoo(split=split), task, rng, ROLLOUTS_PER_POLICY)
+
+    return rollouts
 
 
 def make_planner(name: str, options: PlannerOptions | None = None) -> EgoAgent:

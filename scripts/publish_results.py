@@ -20,7 +20,7 @@ from tab_marl.evaluation.provenance import describe_runs
 from tab_marl.evaluation.report import exports, plots
 from tab_marl.evaluation.report.present import describe_adversaries
 from tab_marl.evaluation.report.results import ReportData, Results, compute
-from tab_marl.evaluation.settings import HEADLINE, PLANNERS
+from tab_marl.evaluation.settings import HEADLINE, PLANNERS, short
 from tab_marl.evaluation.store import Store, StoredSettings
 from tab_marl.evaluation.tables import ALL
 
@@ -68,7 +68,7 @@ def summary(results: Results) -> str:
     """All missions together: a line per family and measure, a column per planner."""
     lines = {(x.family, x.planner): x for x in results.lines if x.mission == ALL}
     planners = [p for p in PLANNERS if any(planner == p for _, planner in lines)]
-    names = [f"**{p.removesuffix('-POMCP')}**" if p == HEADLINE else p.removesuffix("-POMCP") for p in planners]
+    names = [f"**{short(p)}**" if p == HEADLINE else short(p) for p in planners]
     table = ["|  | " + " | ".join(names) + " |", "| --- |" + " ---: |" * len(names)]
     for family in dict.fromkeys(family for family, _ in lines):
         mine = [lines[family, p] for p in planners]

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 
-from tab_marl.agents.planners import GUARDS, PlannerAgent, PlannerOptions
+from tab_marl.agents.planners import GUARDS, PRECEDENTS, PlannerAgent, PlannerOptions
 from tab_marl.agents.policies.cards import Split
 from tab_marl.evaluation.adversaries import opponent, population, zoo_names
 from tab_marl.evaluation.episode import run_episode
@@ -40,8 +40,6 @@ class Variant:
     options: PlannerOptions = field(default_factory=PlannerOptions)
     knows: Literal["those played", "the others"] = "those played"
     """Whose paths population-POMCP draws, and are precedents: of the split that is played, or of the other one."""
-    precedents: bool = False
-    """Whether TAB-POMCP is shown them as well."""
 
 
 def pursuing(planner: str, milliseconds: float = 20, **changes: Any) -> Variant:
@@ -65,8 +63,8 @@ VARIANTS: dict[str, Variant] = {
     "population 50 ms": pursuing("population-POMCP", 50),
     "population of others": replace(pursuing("population-POMCP"), knows="the others"),
     "population of others 50 ms": replace(pursuing("population-POMCP", 50), knows="the others"),
-    "precedents of others": replace(pursuing("TAB-POMCP"), knows="the others", precedents=True),
-    "precedents of others 50 ms": replace(pursuing("TAB-POMCP", 50), knows="the others", precedents=True),
+    "precedents of others": replace(pursuing(PRECEDENTS), knows="the others"),
+    "precedents of others 50 ms": replace(pursuing(PRECEDENTS, 50), knows="the others"),
     "oracle": pursuing("oracle"),
     "S-POMCP": pursuing("S-POMCP"),
     "FP-POMCP": pursuing("FP-POMCP"),
@@ -102,8 +100,7 @@ def play(
     names = zoo_names(split)
     other: Split = "final" if split == "development" else "development"
     known = population(names if variant.knows == "those played" else zoo_names(other))
-    shown = known if variant.precedents else None
-    agent = PlannerAgent(variant.planner, replace(variant.options, rollouts=known, precedents=shown))
+    agent = PlannerAgent(variant.planner, replace(variant.options, rollouts=known, precedents=known))
     policy = opponent(names[unit.seed % len(names)])
     row = run_episode(
         task, agent, policy, episode_seed, False, unit.seed, planner_seed, max_steps=11 if warm else None

@@ -50,6 +50,12 @@ def population(names: Sequence[str]) -> Rollouts:
     return rollouts
 
 
+def precedents(played: str) -> Rollouts:
+    """What TAB-POMCP+precedents is shown: trajectories of the shipped development policies, never of the one that it plays."""
+    name = opponent(played).name
+    return population([other for other in zoo_names("development") if other != name])
+
+
 def digest(policy: ZooPolicy) -> str:
     """Of what decides how a policy plays: its weights, and what its card says of the network and of the routes it is shown."""
     said = policy.card.model_dump_json(include={"name", "sha256", "network", "style"})

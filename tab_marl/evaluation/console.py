@@ -10,7 +10,7 @@ from rich.table import Table
 from tab_marl.evaluation import tables
 from tab_marl.evaluation.report.paper import PAPER
 from tab_marl.evaluation.rows import EpisodeRow
-from tab_marl.evaluation.settings import HEADLINE
+from tab_marl.evaluation.settings import HEADLINE, short
 from tab_marl.evaluation.statistics import Interval, Paired, stars
 from tab_marl.evaluation.tables import Line
 
@@ -42,7 +42,7 @@ def _cells(line: Line) -> dict[str, str]:
     figure = PAPER.get((line.mission, line.planner)) if line.family == "point" else None
     return {
         "": line.mission,
-        "planner": line.planner.removesuffix("-POMCP"),
+        "planner": short(line.planner),
         "n": f"{line.episodes}" + (f" ({line.errors} failed)" if line.errors else ""),
         MEASURED[3]: percent(line.atcr),
         f"paper {MEASURED[3]}": f"{figure.atcr_percent:.1f}" if figure else "",

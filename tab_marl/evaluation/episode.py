@@ -17,7 +17,7 @@ import numpy as np
 from tab_marl.agents.adversaries import AdversaryPolicy
 from tab_marl.agents.planners import EgoAgent, PlannerOptions, make_planner
 from tab_marl.envs.intercept_v0 import parallel_env
-from tab_marl.evaluation.adversaries import opponent, population
+from tab_marl.evaluation.adversaries import opponent, population, precedents
 from tab_marl.evaluation.engines.local import stop_requested
 from tab_marl.evaluation.errors import Interrupted
 from tab_marl.evaluation.report.replay import Trace, shrink
@@ -207,7 +207,9 @@ def play_unit(job: Job, trace: bool = False) -> list[Played]:
                     free = replace(task.scenario, rewards=replace(task.scenario.rewards, mission_completed=0.0))
                     task = replace(task, scenario=free)
             options = PlannerOptions(
-                tab_field=FieldOptions.preset(job.planner_preset), rollouts=population(job.adversaries)
+                tab_field=FieldOptions.preset(job.planner_preset),
+                rollouts=population(job.adversaries),
+                precedents=precedents(job.adversary),
             )
             planner = make_planner(name, options)
             if job.learned is not None:

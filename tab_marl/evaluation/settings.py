@@ -17,10 +17,20 @@ from tab_marl.evaluation.errors import UserError, require_known
 MISSIONS = ("M1", "M2", "M3", "M4", "M5")
 FAMILIES = ("point", "perimeter", "ambiguous")
 PAPER_PLANNERS = ("S-POMCP", "FP-POMCP", "MLE-POMCP", "TAB-POMCP")
+OWN_PLANNERS = ("TAB-POMCP+precedents",)
+"""Beyond the paper's."""
+COMPETING_PLANNERS = (*PAPER_PLANNERS, *OWN_PLANNERS)
 REFERENCE_PLANNERS = ("population-POMCP", "oracle", "random")
-PLANNERS = (*PAPER_PLANNERS, *REFERENCE_PLANNERS)
+"""They know what no ego can know, or nothing: bounds, which do not compete."""
+PLANNERS = (*COMPETING_PLANNERS, *REFERENCE_PLANNERS)
 LEARNS_ACROSS_EPISODES = frozenset({"MLE-POMCP"})
 HEADLINE = "TAB-POMCP"
+
+
+def short(planner: str) -> str:
+    """A planner's name where space is scarce."""
+    return planner.replace("-POMCP", "")
+
 
 # What decides an episode: a change in any of these makes rows that must not be mixed with older ones.
 CODE = ("world", "mission", "field", "planning", "envs", "agents")

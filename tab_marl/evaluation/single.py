@@ -19,16 +19,17 @@ def watch_episode(
     mission: str, family: str, scenario: str, planner: str, adversary: str | None, seed: int, out: Path | None
 ) -> str:
     """Play one episode to a window or a file; returns how it ended."""
-    from tab_marl.agents.planners import PLANNERS, make_planner
+    from tab_marl.agents.planners import PLANNERS, PlannerOptions, make_planner
     from tab_marl.envs.task_source import task_source
     from tab_marl.evaluation import film
-    from tab_marl.evaluation.adversaries import opponent, resolve_opponents
+    from tab_marl.evaluation.adversaries import opponent, precedents, resolve_opponents
     from tab_marl.evaluation.episode import run_episode
     from tab_marl.evaluation.report.replaying import outcome
     from tab_marl.mission import to_english
 
     (planner,) = require_known("planner", (planner,), PLANNERS)
-    policy = opponent(next(iter(resolve_opponents((adversary,) if adversary else ()))))
+    played_by = next(iter(resolve_opponents((adversary,) if adversary else ())))
+    policy = opponent(played_by)
     if out is None:
         if not (sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
             raise UserError("there is no display to open a window on; write a film with --out episode.gif")
@@ -37,7 +38,7 @@ def watch_episode(
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     with user_input():
         task = task_source(None, mission, scenario, family)(np.random.default_rng(seed))
-    agent = make_planner(planner)
+    agent = make_planner(planner, PlannerOptions(precedents=precedents(played_by)))
     frames: list[film.Frame] = []
 
     def on_step(env: Any) -> None:

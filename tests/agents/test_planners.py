@@ -1,4 +1,4 @@
-"""The planners as agents: one contract for all seven, played in the environment's kinematics."""
+"""The planners as agents: one contract for all eight, played in the environment's kinematics."""
 
 import json
 import math
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tab_marl.agents.planners import PLANNERS, PlannerOptions, goal_places, make_planner
+from tab_marl.agents.planners import PLANNERS, PRECEDENTS, PlannerOptions, goal_places, make_planner
 from tab_marl.agents.pretraining import pretrained, untrained
 from tab_marl.envs.ego_observation import observe_ego
 from tab_marl.envs.physics import Motion
@@ -169,12 +169,8 @@ def test_goal_places_are_waypoints_for_every_mission_type(mission: str) -> None:
         assert np.hypot(*(agent.routes.waypoints - place).T).min() < 0.2  # type: ignore[attr-defined]
 
 
-def test_tab_pomcp_can_be_shown_precedents() -> None:
-    """The belief is then partly theirs."""
-    plain, shown = (
-        make_planner("TAB-POMCP", SMALL),
-        make_planner("TAB-POMCP", replace(SMALL, precedents=straight_lines)),
-    )
+def test_with_precedents_the_belief_is_partly_theirs() -> None:
+    plain, shown = make_planner("TAB-POMCP", SMALL), make_planner(PRECEDENTS, SMALL)
     play(plain, WAIT, seed=3, seconds=3.0)
     play(shown, WAIT, seed=3, seconds=3.0)
     model = shown._model

@@ -26,6 +26,7 @@ SKILL = {
     "FP-POMCP": 0.4,
     "MLE-POMCP": 0.5,
     "TAB-POMCP": 0.75,
+    "TAB-POMCP+precedents": 0.78,
     "population-POMCP": 0.8,
     "oracle": 1.0,
     "random": 0.05,

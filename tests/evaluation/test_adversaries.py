@@ -8,8 +8,9 @@ import shutil
 import numpy as np
 import pytest
 
+from tab_marl.agents import planners
 from tab_marl.agents.policies.zoo import SHIPPED, ZOO_VARIABLE, find_policy, load_policy, load_zoo
-from tab_marl.evaluation.adversaries import digest, opponent, population, resolve_opponents, zoo_names
+from tab_marl.evaluation.adversaries import digest, opponent, population, precedents, resolve_opponents, zoo_names
 from tab_marl.evaluation.errors import UserError
 from tab_marl.evaluation.evaluate import prepare
 from tab_marl.evaluation.settings import EvaluationSettings
@@ -99,3 +100,18 @@ def test_every_caller_has_a_recurrent_policy_with_a_memory_of_its_own() -> None:
         if step == 3:
             population(["fickle-lstm"])(task, np.random.default_rng(5))
         np.testing.assert_array_equal(playing.act(observation), alone.act(observation))
+
+
+def test_precedents_are_never_of_the_policy_that_is_played():
+    """TAB-POMCP+precedents is shown the development policies, less the one it plays, by whatever name it was asked for."""
+    task = sample_task(np.random.default_rng(6), "M1")
+    development = zoo_names("development")
+    played = development[0]
+    of_others, _ = population(development[1:])(task, np.random.default_rng(0))
+    for called in (played, str(SHIPPED / played)):
+        np.testing.assert_array_equal(precedents(called)(task, np.random.default_rng(0))[0], of_others)
+    for called in (zoo_names("final")[0], "scripted"):
+        shown, _ = precedents(called)(task, np.random.default_rng(0))
+        np.testing.assert_array_equal(shown, population(development)(task, np.random.default_rng(0))[0])
+    unchosen, _ = planners.zoo_rollouts("development")(task, np.random.default_rng(0))
+    np.testing.assert_array_equal(unchosen, shown)

@@ -52,7 +52,7 @@ def test_page_fits_and_follows_the_theme(browser, path, width, dark):
     assert (browser.run(luminance) < 200) != dark
     assert browser.run("document.getElementById('theme').textContent") == ("Dark" if dark else "Light")
     colours = "new Set([...document.querySelectorAll('svg.chart .mark')].map(m => getComputedStyle(m).stroke)).size"
-    assert browser.run(colours) == 5  # the paper's four, and one for all references
+    assert browser.run(colours) == 6  # the paper's four, ours with precedents, and one for all references
     assert_quiet(browser, path)
 
 

@@ -80,7 +80,7 @@ def test_nothing_to_choose_from(synthetic):
 
 
 def test_replays_of_the_longest_episodes_are_small():
-    """Three replays of seven planners over 100 s, beliefs as they are: a page with them stays well below ten megabytes."""
+    """Three replays of eight planners over 100 s, beliefs as they are: a page with them stays well below ten megabytes."""
     rng = np.random.default_rng(0)
     place = np.stack(np.meshgrid(np.arange(30), np.arange(30)), axis=-1)
     walk = 1.5 + np.cumsum(rng.normal(0, 0.02, size=(1000, 6)), axis=0)
@@ -89,4 +89,4 @@ def test_replays_of_the_longest_episodes_are_small():
         spread = np.exp(-((place - rng.uniform(5, 25, size=2)) ** 2).sum(axis=-1) / rng.uniform(5, 200))
         trace.beliefs.append((k, spread * (spread > 1e-3)))
     size = len(json.dumps(replay.encode_trace(trace), separators=(",", ":")))
-    assert 3 * 7 * size < 5_000_000
+    assert 3 * 8 * size < 5_000_000

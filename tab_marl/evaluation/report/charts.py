@@ -9,10 +9,11 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
+from tab_marl.evaluation.settings import short
 from tab_marl.evaluation.statistics import Interval
 
 WIDTH = 300
-LABELS = 82
+LABELS = 104
 """Width kept for the planners' names."""
 ROW = 21
 FOOT = 34
@@ -24,7 +25,7 @@ MARKS = 4
 
 def css_name(planner: str) -> str:
     """Class of a planner's marks."""
-    return "p-" + planner.casefold().replace("-pomcp", "")
+    return "p-" + short(planner).casefold().replace("+", "-")
 
 
 @dataclass(frozen=True)
@@ -91,13 +92,16 @@ def interval_plot(
 
 
 def mark(planner: str, x: float, y: float, size: float = 4.5) -> str:
-    """Each planner has a shape beside its colour: filled for the paper's four, hollow for the reference rows."""
+    """Each planner has a shape beside its colour: filled for those that compete, hollow for the reference rows."""
     s = size
+    a, b = 0.45 * s, 1.1 * s
     shapes = {
         "S-POMCP": f'<rect class="mark" x="{x - s:.1f}" y="{y - s:.1f}" width="{2 * s}" height="{2 * s}"/>',
         "FP-POMCP": f'<path class="mark" d="M{x - s - 1:.1f} {y + s:.1f}h{2 * s + 2}l{-s - 1} {-2 * s - 1}z"/>',
         "MLE-POMCP": f'<path class="mark" d="M{x - s - 1:.1f} {y - s:.1f}h{2 * s + 2}l{-s - 1} {2 * s + 1}z"/>',
         "TAB-POMCP": f'<circle class="mark" cx="{x:.1f}" cy="{y:.1f}" r="{s + 1}"/>',
+        "TAB-POMCP+precedents": f'<path class="mark" d="M{x - a:.1f} {y - b:.1f}h{2 * a:.1f}v{b - a:.1f}h{b - a:.1f}v{2 * a:.1f}'
+        f'h{a - b:.1f}v{b - a:.1f}h{-2 * a:.1f}v{a - b:.1f}h{a - b:.1f}v{-2 * a:.1f}h{b - a:.1f}z"/>',
         "oracle": f'<circle class="mark hollow" cx="{x:.1f}" cy="{y:.1f}" r="{s}"/>',
         "population-POMCP": f'<rect class="mark hollow" x="{x - s:.1f}" y="{y - s:.1f}" width="{2 * s}" height="{2 * s}"/>',
     }
@@ -212,11 +216,6 @@ def ticks(maximum: float, minimum: float = 0.0) -> list[float]:
     step = min((m * magnitude for m in (1, 2, 2.5, 5, 10)), key=lambda s: abs(s - raw))
     first = np.ceil(minimum / step - 1e-6) * step
     return [float(v) + 0.0 for v in np.arange(first, maximum + step * 1e-6, step)]
-
-
-def short(planner: str) -> str:
-    """A planner's name as charts write it."""
-    return planner.removesuffix("-POMCP")
 
 
 def _open(width: int, height: int, title: str, name: str = "chart") -> str:

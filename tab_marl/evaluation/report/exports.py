@@ -10,11 +10,10 @@ from typing import Any
 from tab_marl.evaluation import tables
 from tab_marl.evaluation.errors import UserError
 from tab_marl.evaluation.report import numbers
-from tab_marl.evaluation.report.charts import short
 from tab_marl.evaluation.report.numbers import Shown
 from tab_marl.evaluation.report.paper import PAPER
 from tab_marl.evaluation.report.results import Results
-from tab_marl.evaluation.settings import HEADLINE, MISSIONS, PAPER_PLANNERS
+from tab_marl.evaluation.settings import HEADLINE, MISSIONS, PAPER_PLANNERS, short
 from tab_marl.evaluation.tables import Share
 
 KINDS = ("md", "tex")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from tab_marl.evaluation.settings import HEADLINE, PAPER_PLANNERS
+from tab_marl.evaluation.settings import HEADLINE, PAPER_PLANNERS, short
 from tab_marl.evaluation.tables import ALL, Line
 
 FEW = 30
@@ -40,21 +40,21 @@ def findings(lines: Sequence[Line]) -> list[tuple[str, list[str]]]:
 
 
 def _completion(headline: Line, rivals: Sequence[Line]) -> str:
-    others = ", ".join(f"{_short(r.planner)} {_percent(r)}" for r in rivals)
+    others = ", ".join(f"{short(r.planner)} {_percent(r)}" for r in rivals)
     text = f"Against TAB-POMCP the adversary completed {_percent(headline)} of its missions ({others})."
     verdicts = [(r.planner, r.atcr_against_headline.verdict if r.atcr_against_headline else 0) for r in rivals]
     return f"{text} {_verdict(verdicts, 'TAB-POMCP lets fewer through than')}"
 
 
 def _interception(headline: Line, rivals: Sequence[Line]) -> str:
-    others = ", ".join(f"{_short(r.planner)} {r.steps.value / 100:.1f}" for r in rivals)
+    others = ", ".join(f"{short(r.planner)} {r.steps.value / 100:.1f}" for r in rivals)
     text = f"It met the adversary after {headline.steps.value / 100:.1f} s on average ({others})."
     verdicts = [(r.planner, r.steps_against_headline.verdict if r.steps_against_headline else 0) for r in rivals]
     return f"{text} {_verdict(verdicts, 'TAB-POMCP is faster than')}"
 
 
 def _verdict(verdicts: Sequence[tuple[str, int]], verb: str) -> str:
-    groups = {sign: [_short(p) for p, v in verdicts if v == sign] for sign in (1, 0, -1)}
+    groups = {sign: [short(p) for p, v in verdicts if v == sign] for sign in (1, 0, -1)}
     clauses = []
     if groups[1]:
         clauses.append(f"{verb} {_join(groups[1])} by more than chance explains")
@@ -68,10 +68,6 @@ def _verdict(verdicts: Sequence[tuple[str, int]], verb: str) -> str:
 
 def _percent(line: Line) -> str:
     return f"{100 * line.atcr.value:.0f} %"
-
-
-def _short(planner: str) -> str:
-    return planner.removesuffix("-POMCP")
 
 
 def _join(names: Sequence[str]) -> str:

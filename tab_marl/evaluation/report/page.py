@@ -18,7 +18,7 @@ from tab_marl.evaluation.report.findings import findings
 from tab_marl.evaluation.report.numbers import Shown
 from tab_marl.evaluation.report.paper import MISSION_TEXT, PAPER, TAB_TIME_RATIO
 from tab_marl.evaluation.report.results import ReportData, Results, compute
-from tab_marl.evaluation.settings import HEADLINE, MISSIONS, PAPER_PLANNERS, PLANNERS
+from tab_marl.evaluation.settings import HEADLINE, MISSIONS, PAPER_PLANNERS, PLANNERS, short
 from tab_marl.evaluation.tables import ALL, Line
 
 __all__ = ["ReportData", "render", "write_report"]
@@ -28,6 +28,7 @@ MODELS = {
     "FP-POMCP": "takes the shortest path to its mission’s goals",
     "MLE-POMCP": "moves with probabilities estimated from the mission and from what was seen of it so far",
     "TAB-POMCP": "anything that completes the mission, no way preferred without reason: the TAB-Field",
+    "TAB-POMCP+precedents": "as TAB-POMCP, or drives as other learned adversaries did on such tasks: whichever foresees better",
     "population-POMCP": "moves as the population of trained adversaries does: not available outside an experiment",
     "oracle": "is seen all the time: the bound on what can be reached",
     "random": "none; the ego drives at random",
@@ -76,7 +77,7 @@ def render(data: ReportData, results: Results | None = None) -> str:
         "points": lambda x: _difference(numbers.difference(x, 100.0)),
         "plain_steps": lambda x: _difference(numbers.difference(x)),
         "p": statistics.stars,
-        "short": charts.short,
+        "short": short,
         "css_name": charts.css_name,
     }
     families = list(dict.fromkeys(line.family for line in found.lines))

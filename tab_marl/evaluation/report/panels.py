@@ -12,7 +12,7 @@ from markupsafe import Markup
 from tab_marl.evaluation.report import charts
 from tab_marl.evaluation.report.paper import PAPER
 from tab_marl.evaluation.rows import Timing
-from tab_marl.evaluation.settings import MISSIONS, PAPER_PLANNERS, PLANNERS
+from tab_marl.evaluation.settings import COMPETING_PLANNERS, MISSIONS, PLANNERS
 from tab_marl.evaluation.statistics import Curve, Interval, bootstrap_mean
 from tab_marl.evaluation.statistics.frames import Key
 from tab_marl.evaluation.tables import ALL, Line, Share, order
@@ -64,7 +64,7 @@ def curve_panels(
         tracks = []
         for planner, curve in part.items():
             value, low, high = curve.at(grid)
-            band = (low, high) if planner in PAPER_PLANNERS else (None, None)
+            band = (low, high) if planner in COMPETING_PLANNERS else (None, None)
             tracks.append(charts.Track(planner, grid, value, *band))
         highest = [float(np.max(t.value if t.high is None else t.high)) for t in tracks if t.planner != "random"]
         top = next(s for s in TOP_SHARES if s >= min(max(highest, default=1.0), 1.0))
@@ -83,7 +83,7 @@ def profile_plot(profiles: pd.DataFrame, family: str) -> Markup:
     tracks = []
     for planner in order(part["planner"], PLANNERS):
         one = part[part["planner"] == planner]
-        band = (one["low"].to_numpy(), one["high"].to_numpy()) if planner in PAPER_PLANNERS else (None, None)
+        band = (one["low"].to_numpy(), one["high"].to_numpy()) if planner in COMPETING_PLANNERS else (None, None)
         tracks.append(charts.Track(planner, one["threshold"].to_numpy(), one["value"].to_numpy(), *band))
     ticks = (0.0, 0.25, 0.5, 0.75, 1.0)
     return Markup(
@@ -98,7 +98,7 @@ def middle_plot(aggregates: pd.DataFrame, family: str) -> Markup:
     dots = [charts.Dot(r.planner, Interval(r.iqm, r.low, r.high, r.episodes)) for r in rows]
     title = f"Interquartile mean of the score, {family}"
     # The planners that compete lie close together: the axis shows them, and says of others where they are.
-    close = [d.interval for d in dots if d.planner in PAPER_PLANNERS] or [d.interval for d in dots]
+    close = [d.interval for d in dots if d.planner in COMPETING_PLANNERS] or [d.interval for d in dots]
     low = max(np.floor(20 * min(i.low for i in close) - 0.5) / 20, 0.0)
     high = min(np.ceil(20 * max(d.interval.high for d in dots) + 0.5) / 20, 1.0)
     unit = "IQM of the score (higher is better)"

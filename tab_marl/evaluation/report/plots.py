@@ -10,9 +10,8 @@ import numpy as np
 
 from tab_marl.evaluation import tables
 from tab_marl.evaluation.errors import UserError
-from tab_marl.evaluation.report.charts import short
 from tab_marl.evaluation.report.results import Results
-from tab_marl.evaluation.settings import PAPER_PLANNERS, PLANNERS
+from tab_marl.evaluation.settings import COMPETING_PLANNERS, PLANNERS, short
 from tab_marl.evaluation.tables import ALL
 
 if TYPE_CHECKING:
@@ -29,6 +28,7 @@ LOOK: dict[str, tuple[str, str, str]] = {
     "FP-POMCP": ("#0f7a4d", "^", "-"),
     "MLE-POMCP": ("#b0368a", "v", "-"),
     "TAB-POMCP": ("#1b5cc4", "o", "-"),
+    "TAB-POMCP+precedents": ("#0b7d94", "P", "-"),
     "population-POMCP": ("#6b7483", "s", "--"),
     "oracle": ("#6b7483", "o", ":"),
     "random": ("#6b7483", "x", ":"),
@@ -96,7 +96,7 @@ def _measures(results: Results, family: str) -> Figure:
             at = np.array([m for m, _ in part]) + 0.11 * (i - (len(planners) - 1) / 2)
             value = scale * np.array([v.value for _, v in part])
             spread = scale * np.array([[v.value - v.low for _, v in part], [v.high - v.value for _, v in part]])
-            hollow = {"markerfacecolor": "white"} if planner not in PAPER_PLANNERS else {}
+            hollow = {"markerfacecolor": "white"} if planner not in COMPETING_PLANNERS else {}
             axis.errorbar(
                 at, value, spread, fmt=mark, color=colour, label=short(planner), elinewidth=1, clip_on=False, **hollow
             )
@@ -112,11 +112,11 @@ def _measures(results: Results, family: str) -> Figure:
 def _curve(axis: Axes, planner: str, x: Any, value: Any, low: Any, high: Any, number: int) -> None:
     colour, mark, line = LOOK.get(planner, UNKNOWN)
     every = (4 * number % max(len(x) // 4, 1), max(len(x) // 4, 1))  # marks of different lines do not meet
-    hollow: dict[str, Any] = {"markerfacecolor": "white"} if planner not in PAPER_PLANNERS else {}
+    hollow: dict[str, Any] = {"markerfacecolor": "white"} if planner not in COMPETING_PLANNERS else {}
     axis.plot(
         x, 100 * value, line, color=colour, marker=mark, markevery=every, label=short(planner), clip_on=False, **hollow
     )
-    if planner in PAPER_PLANNERS:
+    if planner in COMPETING_PLANNERS:
         axis.fill_between(x, 100 * low, 100 * high, color=colour, alpha=0.13, linewidth=0)
 
 

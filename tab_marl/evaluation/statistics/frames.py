@@ -13,7 +13,7 @@ import pandas as pd
 
 from tab_marl.evaluation.errors import UserError
 from tab_marl.evaluation.rows import EpisodeRow
-from tab_marl.evaluation.settings import FAMILIES, HEADLINE, MISSIONS, PLANNERS, REFERENCE_PLANNERS
+from tab_marl.evaluation.settings import FAMILIES, HEADLINE, MISSIONS, OWN_PLANNERS, PLANNERS, REFERENCE_PLANNERS
 from tab_marl.evaluation.statistics.aggregates import (
     aggregate,
     performance_profile,
@@ -114,7 +114,8 @@ def paired(table: pd.DataFrame, baseline: str = HEADLINE, seed: int = SEED) -> d
     """(family, mission, planner, metric) -> the planner minus the baseline over the episodes both played.
 
     Corrected with Holm: within a family of scenarios and a metric, the comparisons of all missions and rivals are made
-    together; so are those of the lines over all missions; reference planners, which do not compete, form groups apart.
+    together; so are those of the lines over all missions; reference planners, which do not compete, form groups apart, and
+    so do planners beyond the paper's.
     """
     found: dict[tuple[str, str, str, str], Paired] = {}
     for family, mission, parts in cells(table):
@@ -129,9 +130,10 @@ def paired(table: pd.DataFrame, baseline: str = HEADLINE, seed: int = SEED) -> d
                 where = both["mission"].tolist()
                 found[family, mission, planner, "ATCR"] = paired_shares(both["lost"], both["lost_base"], where, seed)
                 found[family, mission, planner, "StI"] = paired_steps(both["sti"], both["sti_base"], where, seed)
-    groups: dict[tuple[str, str, bool, bool], dict[object, float]] = {}
+    groups: dict[tuple[str, str, bool, tuple[str, ...]], dict[object, float]] = {}
     for (family, mission, planner, metric), one in found.items():
-        group = (family, metric, mission == ALL, planner in REFERENCE_PLANNERS)
+        apart = next((kind for kind in (OWN_PLANNERS, REFERENCE_PLANNERS) if planner in kind), ())
+        group = (family, metric, mission == ALL, apart)
         groups.setdefault(group, {})[family, mission, planner, metric] = one.p_value
     for together in groups.values():
         for key, p in holm(together).items():
