@@ -6,13 +6,14 @@ and of the README. What the tables mean is written there by hand.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 import tab_marl
-from tab_marl.evaluation import decision_times
+from tab_marl.evaluation import decision_times, statistics
 from tab_marl.evaluation.errors import UserError
 from tab_marl.evaluation.export import export
 from tab_marl.evaluation.population_study import put_tables
@@ -20,10 +21,12 @@ from tab_marl.evaluation.provenance import describe_runs
 from tab_marl.evaluation.report import exports, plots
 from tab_marl.evaluation.report.present import describe_adversaries
 from tab_marl.evaluation.report.results import ReportData, Results, compute
-from tab_marl.evaluation.settings import HEADLINE, PLANNERS, short
+from tab_marl.evaluation.rows import EpisodeRow
+from tab_marl.evaluation.settings import COMPETING_PLANNERS, HEADLINE, PLANNERS, short
 from tab_marl.evaluation.store import Store, StoredSettings
 from tab_marl.evaluation.tables import ALL
 
+CEILING = "population-POMCP"
 RECORDED = ("started", "ended", "episodes", "engine", "machine", "commit", "code", "versions", "zoo")
 
 
@@ -59,6 +62,7 @@ def published(out: Path, folder: Path, rows_name: str) -> dict[str, str]:
     plots.export_figures(results, folder, ["svg"])
     found = {table.name: exports.markdown(table).strip() for table in exports.all_tables(results)}
     found["summary"] = summary(results)
+    found["ceiling"] = ceiling(rows)
     found["record"] = record(stored, runs, count, checksum)
     found["time"] = "```text\n" + "\n".join(decision_times.summary(timings)) + "\n```"
     return found
@@ -77,6 +81,25 @@ def summary(results: Results) -> str:
         table.append(f"| `{family}`, ATCR % | " + " | ".join(shares) + " |")
         table.append(f"| `{family}`, StI | " + " | ".join(steps) + " |")
     return "\n".join(table)
+
+
+def ceiling(rows: Sequence[EpisodeRow]) -> str:
+    """How far TAB-POMCP, alone and with precedents, is from population-POMCP: a line per family and mission."""
+    table = statistics.paired_differences(statistics.frame(rows), CEILING)
+    ours = [p for p in COMPETING_PLANNERS if p.startswith(HEADLINE)]
+    lines = {
+        key: part.set_index(["metric", "planner"]) for key, part in table.groupby(["family", "mission"], sort=False)
+    }
+    head = [f"{measure}, {short(p)}" for measure in ("ATCR", "StI") for p in ours]
+    text = ["| Family | Mission | " + " | ".join(head) + " |", "| --- | --- |" + " ---: |" * len(head)]
+    for (family, mission), part in lines.items():
+        cells = []
+        for measure, scale, digits in (("ATCR", 100, 1), ("StI", 1, 0)):
+            for one in (part.loc[measure, p] for p in ours):
+                value, low, high = (scale * one[k] for k in ("difference", "low", "high"))
+                cells.append(f"{value:+.{digits}f} [{low:+.0f}, {high:+.0f}]")
+        text.append(f"| `{family}` | {mission} | " + " | ".join(cells) + " |")
+    return "\n".join(text)
 
 
 def record(stored: StoredSettings, runs: list[dict[str, str]], count: int, checksum: str) -> str:

@@ -13,6 +13,7 @@ from tab_marl.evaluation import export
 ROOT = Path(__file__).parent.parent.parent
 FOLDER = ROOT / "docs" / "results"
 SHORT = {"**TAB**": "TAB-POMCP", "S": "S-POMCP", "FP": "FP-POMCP", "MLE": "MLE-POMCP", "population": "population-POMCP"}
+SHORT["TAB+precedents"] = "TAB-POMCP+precedents"
 
 
 EPISODES, PERIMETER = (pd.read_csv(FOLDER / f"{name}.csv.xz") for name in ("episodes", "perimeter"))

@@ -26,7 +26,7 @@ __all__ = ["ReportData", "render", "write_report"]
 MODELS = {
     "S-POMCP": "moves at random, as far as its motors allow",
     "FP-POMCP": "takes the shortest path to its mission’s goals",
-    "MLE-POMCP": "moves with probabilities estimated from the mission and from what was seen of it so far",
+    "MLE-POMCP": "moves as other learned adversaries were seen to, and as it was seen to so far, as far as its mission allows",
     "TAB-POMCP": "anything that completes the mission, no way preferred without reason: the TAB-Field",
     "TAB-POMCP+precedents": "as TAB-POMCP, or drives as other learned adversaries did on such tasks: whichever foresees better",
     "population-POMCP": "moves as the population of trained adversaries does: not available outside an experiment",
