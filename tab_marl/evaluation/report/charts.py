@@ -13,7 +13,7 @@ from tab_marl.evaluation.settings import short
 from tab_marl.evaluation.statistics import Interval
 
 WIDTH = 300
-LABELS = 104
+LABELS = 110
 """Width kept for the planners' names."""
 ROW = 21
 FOOT = 34
