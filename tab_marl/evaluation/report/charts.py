@@ -14,7 +14,7 @@ from tab_marl.evaluation.statistics import Interval
 
 WIDTH = 300
 LABELS = 110
-"""Width kept for the planners' names."""
+"""Width kept for the names of planners."""
 ROW = 21
 FOOT = 34
 TOP = 8
@@ -138,8 +138,8 @@ def curve_plot(
     top_share: float = 1.0,
 ) -> str:
     """Shares over x, one line per planner with its marks, `named` at its end; bands as pale areas."""
-    width, height, left, top, foot = 370, 232, 32, 10, 34
-    right = 86 if named else 12
+    width, height, left, top, foot = 400, 232, 32, 10, 34
+    right = LABELS + 6 if named else 12
     w, h = width - left - right, height - top - foot
     start, end = x_range
 
