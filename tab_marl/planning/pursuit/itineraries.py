@@ -81,8 +81,9 @@ class PursuitOptions:
     def for_milliseconds(cls, milliseconds: float, **changes: Any) -> PursuitOptions:
         """The options whose decisions take about so long on one core (2026), the belief's update of about 1 ms included.
 
-        Work is set, not time: the same seed gives the same decision on every machine. `EFFORT` lists the steps; the
-        dearest that fits is taken, the cheapest if none does.
+        Work is set, not time: the same seed gives the same decision on every machine, and missions differ (50 ms takes
+        TAB-POMCP 28 to 66, docs/studies/planner.md). `EFFORT` lists the steps; the dearest that fits is taken, the
+        cheapest if none does.
         """
         fitting = [effort for effort in EFFORT if effort.milliseconds <= milliseconds] or [EFFORT[0]]
         chosen = {name: value for name, value in fitting[-1]._asdict().items() if name != "milliseconds"}
