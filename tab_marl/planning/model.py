@@ -4,7 +4,9 @@
 
 ``step(state, action, data, rng) -> (observation, reward, terminal)``
     Changes `state` in place. `state` is float64[D]: a short vector holds a cell number, a bit mask (exact up to 2**53) or a
-    pose alike, so that one search kernel serves every model; a conversion costs about a nanosecond.
+    pose alike, so that one search kernel serves every model; a conversion costs about a nanosecond. That the process has
+    ended is known from `terminal` alone: no search steps on from there, but a belief may hold a state that has ended before,
+    and then it is for `step` to earn nothing and say terminal again (as tables do), or for the caller to leave it out.
 ``rollout(state, action, observation, depth, max_depth, discount, data, rng) -> float`` (optional)
     The return that follows from `state`, counted from now, in place of random actions: a policy simulated to the end in this
     one call (at most ``max_depth - depth`` steps), or an estimate. `action` and `observation` are the latest. May change `state`.
@@ -14,7 +16,8 @@
     action there. Read from `state` only what the agent itself can see, or the hidden state leaks into the plan.
 
 ``upper(state, depth, max_depth, discount, data) -> float`` (optional, for DESPOT)
-    A return that no policy can exceed from `state` on: often what could be earned if the state were known.
+    A return that no policy can exceed in the ``max_depth - depth`` steps left from `state` on: often what could be earned if
+    the state were known. A bound worked out for one discount says so (`CompiledModel.upper_discount`).
 
 `data` is whatever the functions need: a NamedTuple of arrays and numbers (or a tuple). The search is compiled once per *type*
 of data and cached on disk, so keep dtypes, dimensions and memory order the same from call to call, and let arrays be writable
@@ -72,6 +75,8 @@ class CompiledModel:
     """For people; empty means the numbers."""
     upper: Callable[..., float] | None = None
     """For DESPOT."""
+    upper_discount: float | None = None
+    """The one discount for which `upper` holds; None: whichever it is called with."""
 
     def __post_init__(self) -> None:
         check_actions(self.actions, self.action_names)
