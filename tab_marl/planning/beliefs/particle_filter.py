@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from tab_marl.planning.beliefs.filter_report import Deprivation, EventLog, FilterReport, named
 from tab_marl.planning.beliefs.particle_dynamics import dynamics_of
+from tab_marl.planning.beliefs.recent_history import RecentHistory
 from tab_marl.planning.model import Particles, action_names, draw_particles
 
 Reinvigorate: TypeAlias = Callable[[NDArray[Any], np.random.Generator], NDArray[Any]]
@@ -93,8 +94,7 @@ class ParticleFilter:
         self._dynamics = dynamics_of(self.model, self.likelihood)
         self._names = action_names(self.model)
         self._log = EventLog()
-        self._history: list[tuple[int, Any]] = []
-        self._origins: list[Any] = [self.prior]  # where a replay starts, and the particles `memory` updates later
+        self._history = RecentHistory(self.prior, self.options.memory)
         self._take(self._dynamics.draw(self.prior, self.options.count, self._random))
 
     def sample(self, count: int, rng: np.random.Generator) -> NDArray[Any]:
@@ -115,9 +115,9 @@ class ParticleFilter:
         """Takes the step in which `action` was done, `observation` seen, and the process did not end. Returns itself."""
         if not 0 <= action < self.model.actions:
             raise ValueError(f"action is {action}, must be in 0..{self.model.actions - 1}")
-        self._log.updates += 1
-        self._history.append((action, observation))
         reached = (self._weighed if self._dynamics.weighs else self._matching)(action, observation)
+        self._log.updates += 1  # not before: input that is refused has not been seen
+        self._history.append(action, observation)
         if reached is None:
             self._recover(action, observation)
         else:
@@ -125,8 +125,7 @@ class ParticleFilter:
         self._log.least_effective = min(self._log.least_effective, self.effective)
         if self.effective < self.options.resample_below * self.options.count:
             self._take(self.sample(self.options.count, self._random))
-        if len(self._history) % self.options.memory == 0:
-            self._forget()
+        self._history.keep(self.particles)
         return self
 
     def report(self) -> FilterReport:
@@ -182,7 +181,7 @@ class ParticleFilter:
             detail += f", nor does a replay of {len(self._history)} steps" if self.options.replay else ""
             detail += explained
             event = Deprivation(self._log.updates, named(self._names, action), observation, "fallback", detail)
-            self._history, self._origins = [], [Particles(states)]
+            self._history.restart(Particles(states))
         self._take(states)
         self._log.lost(event)
 
@@ -192,22 +191,27 @@ class ParticleFilter:
         count = self.options.replay * self.options.count
         if count == 0:
             return None
-        states, weights = self._dynamics.draw(self._origins[0], count, self._random), np.full(count, 1 / count)
-        best = 0.0
-        for action, observation in self._history:
-            states, likelihood = self._dynamics.advance(states, action, observation, self._random)
-            best = likelihood.max()
-            if best > 0:
-                weights = weights * np.where(likelihood < 0, 0.0, np.maximum(likelihood, doubt * best))
-            else:  # seen by no particle: if that is forgiven, the observation teaches nothing
-                weights = weights * (likelihood >= 0) * (doubt > 0)
-            if not weights.sum() > 0:
-                return None
-            weights /= weights.sum()
-            if 1.0 / (weights**2).sum() < 0.5 * count:
-                states, weights = states[draw_particles(count, count, weights, self._random)], np.full(count, 1 / count)
+        states = self._dynamics.draw(self._history.origin, count, self._random)
+        weights = np.full(count, 1 / count)
+        best, starts = 0.0, list[Particles]()
+        for stretch in self._history:
+            starts.append(Particles(states, weights))
+            for action, observation in stretch.steps:
+                states, likelihood = self._dynamics.advance(states, action, observation, self._random)
+                best = likelihood.max()
+                if best > 0:
+                    weights = weights * np.where(likelihood < 0, 0.0, np.maximum(likelihood, doubt * best))
+                else:  # seen by no particle: if that is forgiven, the observation teaches nothing
+                    weights = weights * (likelihood >= 0) * (doubt > 0)
+                if not weights.sum() > 0:
+                    return None
+                weights /= weights.sum()
+                if 1.0 / (weights**2).sum() < 0.5 * count:
+                    drawn = draw_particles(count, count, weights, self._random)
+                    states, weights = states[drawn], np.full(count, 1 / count)
         if not best > 0:
             return None
+        self._history.mend(starts)
         return states[draw_particles(self.options.count, count, weights, self._random)]
 
     def _fallen_back(self, action: int, observation: Any) -> tuple[NDArray[Any], str]:
@@ -224,10 +228,3 @@ class ParticleFilter:
                 draw_particles(count, count, weights, self._random)
             ], "; the prior, led through it, is believed"
         return states, "; the prior does not explain it either and is believed as it was"
-
-    def _forget(self) -> None:
-        """Keeps the history bounded: a replay starts from particles of `memory` to twice `memory` updates ago."""
-        self._origins.append(Particles(self.states, self.weights))
-        if len(self._origins) > 2:
-            self._origins = self._origins[1:]
-            self._history = self._history[self.options.memory :]
