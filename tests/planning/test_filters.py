@@ -36,7 +36,7 @@ def brute_force(pomdp, prior, history, floor=0.0):
         weight = prior[path[0]]
         for (a, o), before, reached in zip(history, path, path[1:], strict=False):
             chance = max(observation[a][reached, o], floor)
-            weight *= transition[a][before, reached] * chance * (not terminal[reached])
+            weight *= transition[a][before, reached] * chance * (not terminal[before] and not terminal[reached])
         after[path[-1]] += weight
     return after / after.sum()
 

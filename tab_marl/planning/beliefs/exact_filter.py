@@ -10,12 +10,22 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
 
-from tab_marl.planning.beliefs.filter_report import Deprivation, EventLog, FilterReport, ImpossibleObservation, named
+from tab_marl.planning.beliefs.filter_report import (
+    Deprivation,
+    EventLog,
+    FilterReport,
+    ImpossibleObservation,
+    Remedy,
+    named,
+)
+from tab_marl.planning.beliefs.observations import observation_number
 from tab_marl.planning.model import CompiledModel, Particles, action_names
 from tab_marl.planning.tables import SparseData, SparseRows, TableData
 
 _LISTED = 5
 """Observations that a message lists as possible."""
+_LEAST = 1e-200
+"""The least probability of a state that is possible. Without it a few hundred unlikely steps round a state to zero for good."""
 
 
 @dataclass(eq=False)
@@ -24,12 +34,17 @@ class ExactFilter:
 
     An observation of probability zero contradicts the tables. It is said what was seen and when (`BeliefWarning`, `report`), and
     the belief is made anew: the history is replayed, forgiving, with weight `doubt`, states that do not explain what was seen;
-    where no state explains the latest observation, the `fallback` is believed. With `strict`, ImpossibleObservation is raised.
+    where no state explains the latest observation, the `fallback` is believed. Once it has replayed, a filter replays too where
+    it is likelier that the latest observation misleads than that all those against it did. With `strict`, ImpossibleObservation
+    is raised.
+
+    No history is kept for that: what a replay of everything would give is carried along as a second belief, so that a filter
+    takes the memory of two beliefs however long it runs.
     """
 
     model: CompiledModel
     prior: ArrayLike | None = None
-    """``[S]``, >= 0, of any scale; None: all states alike."""
+    """``[S]``, >= 0, of any scale; None: all states alike that do not end the process."""
     strict: bool = False
     doubt: float = 1e-3
     """In a replay: how well a state that excludes an observation explains it, relative to the state that explains it best."""
@@ -47,15 +62,14 @@ class ExactFilter:
             )
         if not 0 <= self.doubt <= 1:
             raise ValueError(f"doubt is {self.doubt}, must be in [0, 1]")
-        size = len(data.terminal)
-        self._transition = _by_action(data.transition, self.model.actions, size)
-        self._observation = _by_action(data.observation, self.model.actions, 1 + int(_last_column(data.observation)))
+        self._transition = _by_action(data.transition, self.model.actions, len(data.terminal))
+        self._observation = _by_action(data.observation, self.model.actions, _columns(data))
         self._goes_on = ~data.terminal
-        self._prior = self._distribution("prior", np.ones(size) if self.prior is None else self.prior)
+        self._prior = self._distribution("prior", self._goes_on if self.prior is None else self.prior)
         self._names = action_names(self.model)
-        self._history: list[tuple[int, int]] = []
         self._log = EventLog()
         self.probabilities = self._prior
+        self._doubting, self._contradicted = self._prior, False
 
     def predicted(self, action: int) -> NDArray[np.float64]:
         """``[O]``: the probability of each observation after `action`, given that the process goes on."""
@@ -66,19 +80,23 @@ class ExactFilter:
         """Takes the step in which `action` was done, `observation` seen, and the process did not end. Returns itself."""
         if not 0 <= action < self.model.actions:
             raise ValueError(f"action is {action}, must be in 0..{self.model.actions - 1}")
-        seen = self._observation[action].shape[1]
+        observation, seen = observation_number(observation), self._observation[action].shape[1]
         if not 0 <= observation < seen:
             raise ValueError(f"observation is {observation}, must be in 0..{seen - 1}")
-        joint = self._moved(self.probabilities, action) * self._chance(action, observation)
-        if self.strict and not joint.sum() > 0:
+        believed = self._after(self.probabilities, action, observation, doubt=0.0)
+        if self.strict and believed is None:
             raise ImpossibleObservation(self._event(action, observation, None, self._log.updates + 1))
+        doubting = None if self.strict else self._after(self._doubting, action, observation, self.doubt)
+        if self._contradicted and believed is not None and doubting is not None and doubting[believed == 0].sum() > 0.5:
+            believed = (
+                None  # explained, but only by states that nothing but the doubt about earlier steps kept possible
+            )
         self._log.updates += 1
-        self._log.least_effective = float(len(joint))
-        self._history.append((action, observation))
-        if joint.sum() > 0:
-            self.probabilities = joint / joint.sum()
+        self._log.least_effective = float(len(self.probabilities))
+        if believed is None:
+            self._recover(action, observation, doubting)
         else:
-            self._recover(action, observation)
+            self.probabilities, self._doubting = believed, believed if doubting is None else doubting
         return self
 
     def sample(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -101,8 +119,8 @@ class ExactFilter:
         return self._log.report()
 
     def _moved(self, belief: NDArray[np.float64], action: int) -> NDArray[np.float64]:
-        """``[S]`` unnormalised: the states reached from which the process goes on."""
-        moved: NDArray[np.float64] = (belief @ self._transition[action]) * self._goes_on
+        """``[S]`` unnormalised: the states reached from which the process goes on; none is from a state that has ended."""
+        moved: NDArray[np.float64] = ((belief * self._goes_on) @ self._transition[action]) * self._goes_on
         return moved
 
     def _chance(self, action: int, observation: int) -> NDArray[np.float64]:
@@ -110,47 +128,42 @@ class ExactFilter:
         column: Any = self._observation[action][:, [observation]]
         return np.asarray(column.toarray() if hasattr(column, "toarray") else column, dtype=np.float64).ravel()
 
-    def _recover(self, action: int, observation: int) -> None:
-        replayed = self._replayed()
-        event = self._event(action, observation, "replay" if replayed is not None else "fallback", self._log.updates)
-        if replayed is not None:
-            self.probabilities = replayed
-        else:
-            self.probabilities = self._fallen_back(action, observation)
-            self._history, self._prior = [], self.probabilities
-        self._log.lost(event)
+    def _after(
+        self, belief: NDArray[np.float64], action: int, observation: int, doubt: float
+    ) -> NDArray[np.float64] | None:
+        """``[S]``: the belief after a step, in which a state explains the observation at least `doubt` times as well as the one
+        reached that explains it best; None where no state reached explains it."""
+        moved, chance = self._moved(belief, action), self._chance(action, observation)
+        weight = np.maximum(chance, doubt * chance[moved > 0].max(initial=0.0))
+        joint = moved * weight
+        if not joint.sum() > 0:
+            return None
+        after: NDArray[np.float64] = np.maximum(joint / joint.sum(), _LEAST * ((moved > 0) & (weight > 0)))
+        return after
 
-    def _replayed(self) -> NDArray[np.float64] | None:
-        belief = self._prior
-        explained = False
-        for action, observation in self._history:
-            moved = self._moved(belief, action)
-            chance = self._chance(action, observation)
-            best = chance[moved > 0].max(initial=0.0)
-            explained = bool(best > 0)
-            belief = moved * np.maximum(chance, self.doubt * best) if explained else moved
-            if not belief.sum() > 0:
-                return None
-            belief = belief / belief.sum()
-        return belief if explained else None
+    def _recover(self, action: int, observation: int, doubting: NDArray[np.float64] | None) -> None:
+        """Believes what a forgiving replay gives, or where that explains nothing either, the fallback."""
+        remedy: Remedy = "fallback" if doubting is None else "replay"
+        event = self._event(action, observation, remedy, self._log.updates)
+        self._doubting = self._fallen_back(action, observation) if doubting is None else doubting
+        self.probabilities, self._contradicted = self._doubting, doubting is not None
+        self._log.lost(event)
 
     def _fallen_back(self, action: int, observation: int) -> NDArray[np.float64]:
         if self.fallback is not None:
             return self._distribution("fallback", self.fallback(action, observation))
+        after = self._after(self._prior, action, observation, doubt=0.0)
+        if after is not None:
+            return after
         moved = self._moved(self._prior, action)
-        joint = moved * self._chance(action, observation)
-        for belief in (joint, moved):
-            if belief.sum() > 0:
-                return belief / belief.sum()
-        return self._prior
+        return moved / moved.sum() if moved.sum() > 0 else self._prior
 
-    def _event(self, action: int, observation: int, remedy: Any, step: int) -> Deprivation:
+    def _event(self, action: int, observation: int, remedy: Remedy | None, step: int) -> Deprivation:
         chances = self.predicted(action)
         likely = [o for o in np.argsort(-chances, kind="stable")[:_LISTED] if chances[o] > 0]
         possible = ", ".join(f"{o} ({chances[o]:.3g})" for o in likely)
-        detail = (
-            f"probability 0; possible: {possible}" if likely else "probability 0; the process must have ended before"
-        )
+        because = f"possible: {possible}" if likely else "the process must have ended before"
+        detail = f"probability {chances[observation]:.3g}; {because}"
         return Deprivation(step, named(self._names, action), observation, remedy, detail)
 
     def _distribution(self, name: str, given: ArrayLike) -> NDArray[np.float64]:
@@ -161,17 +174,23 @@ class ExactFilter:
         return p / p.sum()
 
 
-def _last_column(rows: NDArray[np.float64] | SparseRows) -> int:
-    return int(rows.number.max()) if isinstance(rows, SparseRows) else rows.shape[1] - 1
+def _columns(data: TableData | SparseData) -> int:
+    """Observations that the tables have, whether or not they can come."""
+    return data.observation.columns if isinstance(data, SparseData) else data.observation.shape[1]
 
 
 def _by_action(rows: NDArray[np.float64] | SparseRows, actions: int, columns: int) -> list[Any]:
-    """Per action the probabilities ``[S, columns]``, dense or sparse as the tables are, from the cumulative ones."""
+    """Per action the probabilities ``[S, columns]``, dense or sparse as the tables are, from the cumulative ones.
+
+    Differences of rounded sums can fall below 0 by a rounding error; no probability does.
+    """
     if not isinstance(rows, SparseRows):
-        return list(np.diff(rows.reshape(actions, -1, columns), axis=2, prepend=0.0))
+        return list(np.maximum(np.diff(rows.reshape(actions, -1, columns), axis=2, prepend=0.0), 0.0))
     chances = np.diff(rows.cumulative, prepend=0.0)
     starts = rows.first[:-1]
     chances[starts] = rows.cumulative[starts]
-    table = scipy.sparse.csr_array((chances, rows.number, rows.first), shape=(len(rows.first) - 1, columns))
+    table = scipy.sparse.csr_array(
+        (np.maximum(chances, 0.0), rows.number, rows.first), shape=(len(rows.first) - 1, columns)
+    )
     size = table.shape[0] // actions
     return [table[a * size : (a + 1) * size] for a in range(actions)]
