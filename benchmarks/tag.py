@@ -13,7 +13,7 @@ import argparse
 import platform
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numba
@@ -21,9 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tab_marl.planning import CompiledModel, Pomcp, PomcpOptions
-from tab_marl.planning.textbook import SEES_TARGET, TAG, TagBelief, play_tag, tag, tag_data
+from tab_marl.planning.random_kernels import GOLDEN
+from tab_marl.planning.textbook import SEES_TARGET, TAG, TagBelief, TagData, play_tag, tag, tag_data, tag_kernels
 
 DISCOUNT = 0.95
+PER_WORD = np.uint64(pow(int(GOLDEN), -1, 2**64))
+"""Every random number adds GOLDEN to a stream's word: a difference of words, times this, is how many were drawn between."""
 
 
 class PlainTag:
@@ -71,6 +74,43 @@ class PlainTag:
         return total
 
 
+def counted_step(state, action, data, rng):  # type: ignore[no-untyped-def]
+    tables, _ = data
+    return _step(state, action, tables, rng)
+
+
+def counted_uniform(state, action, observation, depth, max_depth, discount, data, rng):  # type: ignore[no-untyped-def]
+    tables, steps = data
+    word = rng[0]
+    total = _uniform(state, action, observation, depth, max_depth, discount, tables, rng)
+    steps[0] += (rng[0] - word) * PER_WORD  # each step draws one
+    return total
+
+
+def counted_history(state, action, observation, depth, max_depth, discount, data, rng):  # type: ignore[no-untyped-def]
+    tables, steps = data
+    word = rng[0]
+    total = _history(state, action, observation, depth, max_depth, discount, tables, rng)
+    drawn = (rng[0] - word) * PER_WORD
+    steps[0] += min(drawn + np.uint64(1), np.uint64(max_depth - depth))  # the tag at the end draws none
+    return total
+
+
+_step, _uniform, _history = map(
+    numba.njit, (tag_kernels.step, tag_kernels.uniform_rollout, tag_kernels.history_rollout)
+)
+_COUNTED = {tag_kernels.uniform_rollout: counted_uniform, tag_kernels.history_rollout: counted_history}
+
+
+def steps_of(model: CompiledModel, options: PomcpOptions, states: Any, seed: int) -> int:
+    """Steps of one plan, in the tree and in rollouts: the same search with rollouts that count theirs."""
+    counter = np.zeros(1, dtype=np.uint64)
+    counted: tuple[TagData, NDArray[np.uint64]] = model.data, counter
+    rollout = None if model.rollout is None else _COUNTED[model.rollout]
+    plan = Pomcp(replace(model, step=counted_step, rollout=rollout, data=counted), options).plan(states, seed)
+    return plan.steps + int(counter[0])
+
+
 @dataclass
 class Rate:
     simulations: float
@@ -97,19 +137,19 @@ def rate(model: Any, options: PomcpOptions, beliefs: list[TagBelief], repeats: i
     """Simulations and steps per CPU second of `plan`."""
     planner = Pomcp(model, options)
     rng = np.random.default_rng(0)
-    counter = model.data.rollout_steps if isinstance(model, CompiledModel) else None
     simulations = steps = 0
     seconds = 0.0
     for seed, belief in enumerate(beliefs):
         states: Any = belief.sample(options.simulations, rng)
-        if counter is None:
+        if isinstance(model, PlainTag):
             states = [(int(robot), int(target)) for robot, target in states]
             model.steps = 0
-        else:
-            counter[0] = 0
         plan = planner.plan(states, seed)  # compiles, or loads; the same seed takes the same steps each time
         simulations += plan.simulations
-        steps += plan.steps + (model.steps if counter is None else int(counter[0]))
+        if isinstance(model, PlainTag):
+            steps += plan.steps + model.steps
+        else:
+            steps += steps_of(model, options, states, seed)
         times = []
         for _ in range(repeats):
             started = time.process_time()

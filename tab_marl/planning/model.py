@@ -13,7 +13,8 @@
 ``prior(state, action, observation, depth, data, values, counts)`` (optional)
     Called when a node gets its actions; all values and counts are 0 before. Writes ``values[a]`` (a return) and ``counts[a]``:
     that many simulations are taken as done (Silver and Veness 2010, section 3.4 "preferred actions"); a count of -1 forbids the
-    action there. Read from `state` only what the agent itself can see, or the hidden state leaks into the plan.
+    action there. At a root where nothing was done yet `action` and `observation` are -1, if the caller asks there at all
+    (`Pomcp.plan`, ``latest=START``). Read from `state` only what the agent itself can see, or the hidden state leaks into the plan.
 
 ``upper(state, depth, max_depth, discount, data) -> float`` (optional, for DESPOT)
     A return that no policy can exceed in the ``max_depth - depth`` steps left from `state` on: often what could be earned if
@@ -21,7 +22,8 @@
 
 `data` is whatever the functions need: a NamedTuple of arrays and numbers (or a tuple). The search is compiled once per *type*
 of data and cached on disk, so keep dtypes, dimensions and memory order the same from call to call, and let arrays be writable
-and C-contiguous. `rng` is uint64[1] for `tab_marl.planning.random_kernels`. Return ``np.int64`` observations, float rewards, bool terminals.
+and C-contiguous. Functions compiled by numba do not check indices: `states` says what the states are (`StateRange`), so that
+a belief that holds something else is refused and not looked up. `rng` is uint64[1] for `tab_marl.planning.random_kernels`. Return ``np.int64`` observations, float rewards, bool terminals.
 
 **Continuous observations** (`ContinuousModel`, for `tab_marl.planning.search.pomcpow.Pomcpow`): compiled functions again, but
 
@@ -40,9 +42,10 @@ and C-contiguous. `rng` is uint64[1] for `tab_marl.planning.random_kernels`. Ret
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sized
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Integral
 from typing import Any, Protocol, TypeAlias
 
 import numba
@@ -51,11 +54,34 @@ from numba import typeof, types
 from numpy.typing import ArrayLike, NDArray
 
 from tab_marl.planning.callbacks import callback
+from tab_marl.planning.search.bounds import require_whole
+from tab_marl.planning.state_kernels import ALL_STATES, first_outside
 
 _STATE = types.Array(types.float64, 1, "C")
 _COUNTS = types.Array(types.int64, 1, "C")
 _RNG = types.Array(types.uint64, 1, "C")
 _STEP_RESULT = types.Tuple((types.int64, types.float64, types.boolean))
+
+
+@dataclass(frozen=True, eq=False)
+class StateRange:
+    """What the states of a model are, entry by entry.
+
+    Compiled functions look states up in tables without checking; a plan or a filter refuses what is out of this range first.
+    """
+
+    lowest: ArrayLike
+    """``[D]``; ``-np.inf`` where there is no bound."""
+    highest: ArrayLike
+    """``[D]``, itself allowed; ``np.inf`` where there is no bound."""
+    whole: ArrayLike = True
+    """``[D]`` bool, or one for all: entries that must be whole numbers."""
+
+    @cached_property
+    def entries(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+        """(lowest, highest, whole), each ``[D]``."""
+        lowest, highest, whole = np.broadcast_arrays(*map(np.atleast_1d, (self.lowest, self.highest, self.whole)))
+        return lowest.astype(np.float64), highest.astype(np.float64), whole.astype(np.bool_)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,11 +103,12 @@ class CompiledModel:
     """For DESPOT."""
     upper_discount: float | None = None
     """The one discount for which `upper` holds; None: whichever it is called with."""
+    states: StateRange | None = None
+    """What a belief's states are checked against; None: any D numbers are a state."""
 
     def __post_init__(self) -> None:
         check_actions(self.actions, self.action_names)
-        if self.state_size < 1:
-            raise ValueError(f"state_size is {self.state_size}, must be >= 1")
+        _check_state_size(self)
 
     @cached_property
     def functions(self) -> tuple[Any, Any, Any]:
@@ -129,13 +156,15 @@ class ContinuousModel:
     rollout: Callable[..., float] | None = None
     action_names: tuple[str, ...] = ()
     """For people; empty means the numbers."""
+    states: StateRange | None = None
+    """As in `CompiledModel`."""
 
     def __post_init__(self) -> None:
         check_actions(self.actions, self.action_names)
-        if self.state_size < 1 or self.observation_size < 1:
-            raise ValueError(
-                f"state_size is {self.state_size} and observation_size is {self.observation_size}, both must be >= 1"
-            )
+        _check_state_size(self)
+        require_whole("observation_size", self.observation_size)
+        if self.observation_size < 1:
+            raise ValueError(f"observation_size is {self.observation_size}, must be >= 1")
 
     @cached_property
     def functions(self) -> tuple[Any, Any, Any]:
@@ -168,11 +197,27 @@ class PythonModel(Protocol):
         ...
 
 
-def check_actions(actions: int, names: tuple[str, ...]) -> None:
+def check_actions(actions: Any, names: tuple[str, ...]) -> None:
+    """ValueError unless `actions` is how many there are, and there is a name for each or none."""
+    counted = isinstance(actions, Integral)
+    if not counted:
+        listed = isinstance(actions, Sized) and not isinstance(actions, str)
+        remedy = f": write actions = {len(actions)}, and what they are as action_names" if listed else ""
+        raise ValueError(f"actions is {actions!r}, must be the number of actions, a whole one{remedy}")
     if actions < 1:
         raise ValueError(f"actions is {actions}, must be >= 1")
     if names and len(names) != actions:
         raise ValueError(f"action_names has {len(names)} names for {actions} actions: give one each, or none")
+
+
+def _check_state_size(model: CompiledModel | ContinuousModel) -> None:
+    require_whole("state_size", model.state_size)
+    if model.state_size < 1:
+        raise ValueError(f"state_size is {model.state_size}, must be >= 1")
+    if model.states is not None and len(model.states.entries[0]) != model.state_size:
+        raise ValueError(
+            f"states gives the range of {len(model.states.entries[0])} numbers, must be of state_size = {model.state_size}"
+        )
 
 
 def check_model(model: Any) -> None:
@@ -181,7 +226,7 @@ def check_model(model: Any) -> None:
         raise TypeError(f"the model is the class {model.__name__}: give an instance of it, {model.__name__}(...)")
     if not callable(getattr(model, "step", None)) or not hasattr(model, "actions"):
         raise TypeError(f"the model, a {type(model).__name__}, needs `actions` and `step`: see tab_marl.planning.model")
-    check_actions(model.actions, tuple(getattr(model, "action_names", ())))
+    check_actions(model.actions, _names(model))
 
 
 def check_numbered(model: Any) -> None:
@@ -191,6 +236,19 @@ def check_numbered(model: Any) -> None:
             "the model is a ContinuousModel, whose observations hardly ever repeat: plan with Pomcpow, or sort its observations "
             "into numbered bins in a CompiledModel"
         )
+
+
+def numbered(observation: Any, step: Callable[..., Any]) -> int:
+    """The observation of a compiled model's `step` that runs interpreted: a whole number, as its compiled form insists on.
+
+    Raises TypeError for anything else: a reading cut to a whole number would be another observation.
+    """
+    if isinstance(observation, int | np.integer | np.bool_):
+        return int(observation)
+    raise TypeError(
+        f"{getattr(step, '__name__', 'step')} returned {observation!r} as its observation, which would be cut to a whole number: "
+        "return np.int64(...) of a number that stands for what is seen; for observations that are measured, see ContinuousModel"
+    )
 
 
 class PlainPythonWarning(UserWarning):
@@ -249,7 +307,29 @@ def belief_states(
         raise ValueError(
             "the belief is empty: give at least one state (an updater that lost all particles must refill)"
         )
+    check_states(model, states)
     return states, check_weights(weights, len(states))
+
+
+def check_states(model: CompiledModel | ContinuousModel, states: NDArray[np.float64]) -> None:
+    """ValueError naming the first row of `states` [P, D] that is out of the model's range of states, if it gives one."""
+    if model.states is None:
+        return
+    lowest, highest, whole = model.states.entries
+    at = int(first_outside(states, lowest, highest, whole))
+    if at == ALL_STATES:
+        return
+    row, entry = divmod(at, model.state_size)
+    raise ValueError(
+        f"state {row} of the belief is {states[row].tolist()}: its number {entry} must be "
+        f"{'whole and ' * bool(whole[entry])}in [{lowest[entry]:.16g}, {highest[entry]:.16g}] for this model. A belief is a list "
+        "of states, not of probabilities: give those as weights, Particles(states, weights), or to ExactFilter"
+    )
+
+
+def is_sampler(belief: Any) -> bool:
+    """Whether the belief is a function that is asked for states."""
+    return callable(getattr(belief, "particles", belief))
 
 
 def belief_objects(belief: Any, count: int, rng: np.random.Generator) -> tuple[list[Any], NDArray[np.float64] | None]:
@@ -302,5 +382,9 @@ def draw_particles(
 
 def action_names(model: Any) -> tuple[str, ...]:
     """Names of the model's actions, or their numbers."""
-    names = tuple(getattr(model, "action_names", ()))
-    return names or tuple(str(a) for a in range(model.actions))
+    return _names(model) or tuple(str(a) for a in range(model.actions))
+
+
+def _names(model: Any) -> tuple[str, ...]:
+    names = getattr(model, "action_names", None)
+    return () if names is None else tuple(names)

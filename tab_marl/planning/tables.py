@@ -11,7 +11,7 @@ import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
 
 from tab_marl.planning import table_kernels
-from tab_marl.planning.model import CompiledModel
+from tab_marl.planning.model import CompiledModel, StateRange
 
 
 class TableData(NamedTuple):
@@ -75,7 +75,8 @@ def table_model(
     if discount is not None and not 0 < discount < 1:
         raise ValueError(f"discount is {discount}, must be in (0, 1)")
     make = _sparse_model if all(sparse) else _dense_model
-    return make(transition, observation, reward, terminal, action_names, discount)
+    model = make(transition, observation, reward, terminal, action_names, discount)
+    return replace(model, states=StateRange([0], [len(model.data.terminal) - 1]))
 
 
 def _is_sparse(tables: Any) -> bool:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from numbers import Integral, Real
+from typing import Any
 
 PRECISION = 0.01
 """Without `max_depth`: the weight of a reward beyond the horizon."""
@@ -12,6 +15,29 @@ def require(condition: bool, name: str, value: object, bound: str) -> None:
     """ValueError naming the field, its value and its bounds unless the condition holds."""
     if not condition:
         raise ValueError(f"{name} is {value!r}, must be {bound}")
+
+
+def require_whole(name: str, value: object) -> None:
+    """ValueError naming the field, its value and how to write it unless it is a whole number (Python's or numpy's)."""
+    if isinstance(value, Integral):
+        return
+    remedy = f": write {int(value)}" if isinstance(value, Real) and float(value).is_integer() else ""
+    raise ValueError(f"{name} is {value!r}, must be a whole number{remedy}")
+
+
+def check_kinds(options: Any) -> None:
+    """ValueError naming the first option that is no number, or no whole one, where its annotation says ``float`` or ``int``.
+
+    Asked before any bound is: a comparison with a text or None would fail without saying of what.
+    """
+    for option in dataclasses.fields(options):
+        kind, value = str(option.type), getattr(options, option.name)
+        if value is None and kind.endswith("| None"):
+            continue
+        if kind.startswith("int"):
+            require_whole(option.name, value)
+        elif kind.startswith("float"):
+            require(isinstance(value, Real), option.name, value, "a number")
 
 
 def check_horizon(discount: float, max_depth: int | None, tree_depth: int | None) -> None:

@@ -19,7 +19,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.planning.model import CompiledModel
+from tab_marl.planning.model import CompiledModel, StateRange
 from tab_marl.planning.textbook import chase_maps
 from tab_marl.planning.textbook import laser_tag_kernels as kernels
 from tab_marl.planning.textbook.chase_maps import TAG, Place
@@ -45,6 +45,8 @@ class LaserTagData(NamedTuple):
     """``[kinds of beam, 16]`` cumulative: straight beams of 1.. cells, then diagonal ones."""
     seen_values: NDArray[np.float64]
     """``[C * C]``: best return at discount .95 if the target were always seen."""
+    least_seen: float
+    """The least of `seen_values`."""
     cells: int
 
 
@@ -75,13 +77,15 @@ def laser_tag_data(places: Sequence[Place]) -> LaserTagData:
                 beams[r, places.index((x + nearer * dx, y + nearer * dy)), direction] = nearer + diagonal
     straight = np.array([_reading_chances(float(d)) for d in range(1, longest + 1)])
     slanted = np.array([_reading_chances(d * math.sqrt(2)) for d in range(1, longest + 1)])
+    seen = chase_maps.seen_values(places)
     return LaserTagData(
         chase_maps.robot_moves(places),
         chase_maps.target_moves(places),
         chase_maps.rollout_moves(places, stride=kernels.STRIDE),
         beams.ravel(),
         np.concatenate([straight, slanted]),
-        chase_maps.seen_values(places),
+        seen,
+        float(seen.min()),
         len(places),
     )
 
@@ -114,6 +118,8 @@ def laser_tag(
         rollout=chosen("rollout of LaserTag", rollout, rollouts),
         action_names=chase_maps.ACTION_NAMES,
         upper=kernels.seen_value,
+        upper_discount=0.95,
+        states=StateRange([0, 0], [data.cells - 1] * 2),
     )
 
 

@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.planning.model import CompiledModel, ContinuousModel
+from tab_marl.planning.model import CompiledModel, ContinuousModel, StateRange
 from tab_marl.planning.textbook import light_dark_kernels as kernels
 from tab_marl.planning.textbook.choices import chosen
 
@@ -83,7 +83,9 @@ def light_dark(
     function = chosen("rollout of light-dark", rollout, ROLLOUTS)
     data = light_dark_data() if data is None else data
     names = action_names(data.moves)
-    return ContinuousModel(kernels.step, kernels.likelihood, 5, 1, 1, data, rollout=function, action_names=names)
+    return ContinuousModel(
+        kernels.step, kernels.likelihood, 5, 1, 1, data, function, names, StateRange([-data.radius], [data.radius])
+    )
 
 
 def light_dark_binned(
@@ -92,7 +94,15 @@ def light_dark_binned(
     """Light-dark whose readings are rounded to bins: the discrete problem that POMCP and DESPOT can be given."""
     function = chosen("rollout of light-dark", rollout, ROLLOUTS)
     data = light_dark_data(bin_width=bin_width) if data is None else data
-    return CompiledModel(kernels.binned_step, 5, 1, data, rollout=function, action_names=action_names(data.moves))
+    return CompiledModel(
+        kernels.binned_step,
+        5,
+        1,
+        data,
+        rollout=function,
+        action_names=action_names(data.moves),
+        states=StateRange([-data.radius], [data.radius]),
+    )
 
 
 def action_names(moves: Sequence[float] | NDArray[np.float64]) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.planning.model import CompiledModel
+from tab_marl.planning.model import CompiledModel, StateRange
 from tab_marl.planning.textbook import rock_sample_kernels as kernels
 from tab_marl.planning.textbook.chase_maps import Place
 from tab_marl.planning.textbook.choices import chosen
@@ -155,6 +155,11 @@ def rock_sample(
         prior=chosen("prior of RockSample", prior, priors),
         action_names=("north", "east", "south", "west", "sample", *(f"check {k}" for k in range(data.rocks))),
         upper=kernels.upper,
+        states=StateRange(
+            [0, 0] + [-np.inf] * data.rocks,
+            [data.size**2 - 1, 2**data.rocks - 1] + [np.inf] * data.rocks,
+            [True, True] + [False] * data.rocks,
+        ),
     )
 
 

@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.planning.model import CompiledModel
+from tab_marl.planning.model import CompiledModel, StateRange
 from tab_marl.planning.textbook import chase_maps
 from tab_marl.planning.textbook import tag_kernels as kernels
 from tab_marl.planning.textbook.chase_maps import TAG
@@ -28,10 +28,10 @@ class TagData(NamedTuple):
     """``[29 * 29 * 5]`` target cell after (robot, target, slot), 5 equally likely slots."""
     rollout_moves: NDArray[np.int16]
     """``[29 * 5 * 12]`` (action * 32 + cell after) of the moves worth trying after (cell, last action), 12 equally likely slots."""
-    rollout_steps: NDArray[np.int64]
-    """``[1]`` steps simulated inside rollouts, a counter for benchmarks."""
     seen_values: NDArray[np.float64]
     """``[29 * 29]`` best return at discount .95 from (robot, target) if the target were always seen."""
+    least_seen: float
+    """The least of `seen_values`."""
 
 
 def tag_data() -> TagData:
@@ -40,8 +40,8 @@ def tag_data() -> TagData:
         chase_maps.robot_moves(PLACES),
         chase_maps.target_moves(PLACES),
         chase_maps.rollout_moves(PLACES, stride=32),
-        np.zeros(1, dtype=np.int64),
         _seen_values(),
+        float(_seen_values().min()),
     )
 
 
@@ -80,6 +80,8 @@ def tag(rollout: Literal["history", "uniform", "engine"] = "history", preferred:
         prior=kernels.preferred if preferred else None,
         action_names=chase_maps.ACTION_NAMES,
         upper=kernels.seen_value,
+        upper_discount=0.95,
+        states=StateRange([0, 0], [kernels.CELLS - 1] * 2),
     )
 
 

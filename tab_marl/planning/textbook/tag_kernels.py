@@ -58,9 +58,7 @@ def uniform_rollout(state, action, observation, depth, max_depth, discount, data
     word = rng[0]
     total = 0.0
     weight = 1.0
-    steps = 0
     for _ in range(depth, max_depth):
-        steps += 1
         word = word + GOLDEN
         random = np.uint64(mixed(word))
         action = _low(random, 5)
@@ -75,7 +73,6 @@ def uniform_rollout(state, action, observation, depth, max_depth, discount, data
         target = np.int64(data.target_moves[(robot * CELLS + target) * TARGET_SLOTS + _high(random, TARGET_SLOTS)])
         robot = np.int64(data.robot_moves[robot * 5 + action])
     rng[0] = word
-    data.rollout_steps[0] += steps
     return total
 
 
@@ -86,9 +83,7 @@ def history_rollout(state, action, observation, depth, max_depth, discount, data
     word = rng[0]
     total = 0.0
     weight = 1.0
-    steps = 0
     for _ in range(depth, max_depth):
-        steps += 1
         if robot == target:
             total += weight * 10.0
             break
@@ -101,7 +96,6 @@ def history_rollout(state, action, observation, depth, max_depth, discount, data
         last = move >> 5
         robot = move & 31
     rng[0] = word
-    data.rollout_steps[0] += steps
     return total
 
 
@@ -119,5 +113,9 @@ def preferred(state, action, observation, depth, data, values, counts):
 
 
 def seen_value(state, depth, max_depth, discount, data):
-    """The best return at discount .95 if the target were always seen: no policy can expect more."""
-    return data.seen_values[np.int64(state[0]) * CELLS + np.int64(state[1])]
+    """The best return at discount .95 if the target were always seen: no policy can expect more.
+
+    A chase cut short is spared what would follow, which costs no more than the worst chase does.
+    """
+    spared = discount ** (max_depth - depth) * min(0.0, data.least_seen)
+    return data.seen_values[np.int64(state[0]) * CELLS + np.int64(state[1])] - spared
