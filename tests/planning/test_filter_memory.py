@@ -8,7 +8,6 @@ import warnings
 import numpy as np
 import pytest
 
-
 from tab_marl.planning import textbook
 from tab_marl.planning.beliefs.exact_filter import ExactFilter
 from tab_marl.planning.beliefs.filter_report import BeliefWarning

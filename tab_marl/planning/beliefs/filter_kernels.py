@@ -8,13 +8,16 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+NONE_BROKEN = -1
+
 
 @njit(cache=True, nogil=True)
 def advance(step, likelihood, data, states, action, observation, rng, before, after, weights):
     """Steps `states` [N, D] into `after` [N, D]; `weights` [N] say how well each explains the observation.
 
     With a `likelihood`, by its value at the states left and reached; without, 1 where the simulated observation is the one
-    seen. -1 marks states that ended: the process goes on. `before` [D] is scratch.
+    seen. -1 marks states that ended: the process goes on. `before` [D] is scratch. Returns the first particle whose
+    likelihood is broken, and stops there: its value is in `weights`; or NONE_BROKEN.
     """
     for i in range(len(states)):
         after[i] = states[i]
@@ -27,6 +30,9 @@ def advance(step, likelihood, data, states, action, observation, rng, before, af
         else:
             before[:] = states[i]
             weights[i] = likelihood(before, np.int64(action), state, observation, data)
+            if not 0.0 <= weights[i] < np.inf:
+                return i
+    return NONE_BROKEN
 
 
 @njit(cache=True, nogil=True)
@@ -36,8 +42,14 @@ def advance_seeing(step, likelihood, data, states, action, observation, rng, bef
         after[i] = states[i]
         state = after[i]
         _reward, terminal = step(state, np.int64(action), data, rng, seen)
+        if terminal:
+            weights[i] = -1.0
+            continue
         before[:] = states[i]
-        weights[i] = -1.0 if terminal else likelihood(before, np.int64(action), state, observation, data)
+        weights[i] = likelihood(before, np.int64(action), state, observation, data)
+        if not 0.0 <= weights[i] < np.inf:
+            return i
+    return NONE_BROKEN
 
 
 def table_likelihood(before, action, state, observation, data):
@@ -46,7 +58,7 @@ def table_likelihood(before, action, state, observation, data):
     if observation < 0 or observation >= data.observation.shape[1]:
         return 0.0
     below = data.observation[row, observation - 1] if observation > 0 else 0.0
-    return data.observation[row, observation] - below
+    return max(0.0, data.observation[row, observation] - below)  # a rounding error below 0 is no probability
 
 
 def sparse_table_likelihood(before, action, state, observation, data):
@@ -56,6 +68,6 @@ def sparse_table_likelihood(before, action, state, observation, data):
     below = 0.0
     for entry in range(rows.first[row], rows.first[row + 1]):
         if rows.number[entry] == observation:
-            return rows.cumulative[entry] - below
+            return max(0.0, rows.cumulative[entry] - below)
         below = rows.cumulative[entry]
     return 0.0

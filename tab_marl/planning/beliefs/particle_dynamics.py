@@ -12,12 +12,14 @@ from numba import typeof, types
 from numpy.typing import NDArray
 
 from tab_marl.planning.beliefs import filter_kernels
+from tab_marl.planning.beliefs.observations import observation_number
 from tab_marl.planning.callbacks import callback
 from tab_marl.planning.model import (
     CompiledModel,
     ContinuousModel,
     belief_objects,
     belief_states,
+    check_states,
     draw_particles,
 )
 from tab_marl.planning.tables import SparseData, TableData
@@ -35,10 +37,17 @@ class ParticleDynamics(Protocol):
         """`count` equally weighted states of a belief."""
         ...
 
+    def check(self, states: NDArray[Any]) -> None:
+        """ValueError where these cannot be states of the model."""
+        ...
+
     def advance(
         self, states: NDArray[Any], action: int, observation: Any, rng: np.random.Generator
     ) -> tuple[NDArray[Any], NDArray[np.float64]]:
-        """(states after the step, weights); the weight of a state in which the process ended is -1."""
+        """(states after the step, weights); the weight of a state in which the process ended is -1.
+
+        Raises TypeError or ValueError for what is no observation of the model, and where a likelihood is not finite or negative.
+        """
         ...
 
 
@@ -64,6 +73,14 @@ def _drawn(
     return states[draw_particles(count, len(states), weights, rng)]
 
 
+def _broken_likelihood(value: float, action: int, observation: Any) -> ValueError:
+    """That a likelihood is broken: taken for one that explains nothing, it would pass for a contradiction."""
+    return ValueError(
+        f"the likelihood of observation {observation} after action {action} is {value}, must be finite and >= 0: a probability or "
+        "a density (or a multiple of it), not its logarithm"
+    )
+
+
 class CompiledDynamics:
     """Particles of a `CompiledModel`: rows of an array."""
 
@@ -80,15 +97,21 @@ class CompiledDynamics:
     def draw(self, belief: Any, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
         return _drawn(self.model, belief, count, rng)
 
+    def check(self, states: NDArray[np.float64]) -> None:
+        check_states(self.model, states)
+
     def advance(
         self, states: NDArray[np.float64], action: int, observation: Any, rng: np.random.Generator
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        observation = observation_number(observation)
         word = rng.integers(2**64, size=1, dtype=np.uint64)
         after, weights = np.empty_like(states), np.empty(len(states))
-        filter_kernels.advance(
-            self.model.functions[0], self._likelihood, self.model.data, states, int(action), int(observation), word,
+        broken = filter_kernels.advance(
+            self.model.functions[0], self._likelihood, self.model.data, states, int(action), observation, word,
             np.empty(self.model.state_size), after, weights,
         )  # fmt: skip
+        if broken != filter_kernels.NONE_BROKEN:
+            raise _broken_likelihood(weights[broken], action, observation)
         return after, weights
 
 
@@ -103,6 +126,9 @@ class ContinuousDynamics:
     def draw(self, belief: Any, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
         return _drawn(self.model, belief, count, rng)
 
+    def check(self, states: NDArray[np.float64]) -> None:
+        check_states(self.model, states)
+
     def advance(
         self, states: NDArray[np.float64], action: int, observation: Any, rng: np.random.Generator
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -114,10 +140,12 @@ class ContinuousDynamics:
         word = rng.integers(2**64, size=1, dtype=np.uint64)
         after, weights = np.empty_like(states), np.empty(len(states))
         step, likelihood, _ = self.model.functions
-        filter_kernels.advance_seeing(
+        broken = filter_kernels.advance_seeing(
             step, likelihood, self.model.data, states, int(action), seen, word, np.empty(self.model.state_size),
             after, weights, np.empty_like(seen),
         )  # fmt: skip
+        if broken != filter_kernels.NONE_BROKEN:
+            raise _broken_likelihood(weights[broken], action, seen.tolist())
         return after, weights
 
 
@@ -132,6 +160,9 @@ class PythonDynamics:
         states, weights = belief_objects(belief, count, rng)
         return _objects(states)[draw_particles(count, len(states), weights, rng)]
 
+    def check(self, states: NDArray[Any]) -> None:
+        """Any object may be a state."""
+
     def advance(
         self, states: NDArray[Any], action: int, observation: Any, rng: np.random.Generator
     ) -> tuple[NDArray[Any], NDArray[np.float64]]:
@@ -145,6 +176,8 @@ class PythonDynamics:
                 weights[i] = float(seen == observation)
             else:
                 weights[i] = self._likelihood(state, action, reached, observation)
+                if not 0.0 <= weights[i] < np.inf:
+                    raise _broken_likelihood(weights[i], action, observation)
         return _objects(after), weights
 
 

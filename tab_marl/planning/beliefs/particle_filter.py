@@ -144,6 +144,7 @@ class ParticleFilter:
         chosen = self._random.choice(len(states), size=share, replace=False)
         states = states.copy()
         states[chosen] = self.reinvigorate(states[chosen], self._random)
+        self._dynamics.check(states[chosen])
         return states
 
     def _weighed(self, action: int, observation: Any) -> tuple[NDArray[Any], NDArray[np.float64]] | None:
