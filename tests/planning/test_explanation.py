@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import math
 
@@ -11,6 +12,7 @@ from rich.console import Console
 
 from tab_marl.planning import textbook
 from tab_marl.planning.beliefs.exact_filter import ExactFilter
+from tab_marl.planning.beliefs.particle_filter import FilterOptions, ParticleFilter
 from tab_marl.planning.model import Particles
 from tab_marl.planning.search.explanation import summarise
 from tab_marl.planning.search.pomcp import Pomcp, PomcpOptions
@@ -70,6 +72,61 @@ def test_a_belief_is_summarised_whatever_it_is_made_of():
     objects = summarise([("left", 0), ("right", 0), ("left", 0), ("left", 0)])
     assert objects.entropy == pytest.approx(-0.75 * math.log(0.75) - 0.25 * math.log(0.25))
     assert objects.spread == ()
+
+
+@dataclasses.dataclass
+class Cave:
+    """A state that cannot be hashed, as a dataclass that can be changed."""
+
+    lit: bool
+    rooms: object
+
+
+def caves(kind):
+    """Two distinct states of a kind, the first of them twice, none of them hashable."""
+    large = np.zeros(5000)
+    dark = large.copy()
+    dark[2500] = 1.0  # where numpy writes an ellipsis
+    return {
+        "arrays": [large, dark, large.copy()],
+        "arrays of two shapes": [np.zeros(4), np.zeros((2, 2)), np.zeros(4)],
+        "arrays of objects": [np.array([{"a": 1}, None]), np.array([{"a": 2}, None]), np.array([{"a": 1}, None])],
+        "dicts": [{"at": 1, "seen": {2}}, {"at": 1, "seen": set()}, {"seen": {2}, "at": 1}],
+        "lists": [[1, ["a"]], [1, ["b"]], [1, ["a"]]],
+        "tuples of arrays": [("a", large), ("a", dark), ("a", large.copy())],
+        "dataclasses": [Cave(True, large), Cave(True, dark), Cave(True, large.copy())],
+    }[kind]
+
+
+KINDS = ("arrays", "arrays of two shapes", "arrays of objects", "dicts", "lists", "tuples of arrays", "dataclasses")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_states_that_cannot_be_hashed_are_told_apart(kind):
+    states = np.empty(3, dtype=object)
+    for i, state in enumerate(caves(kind)):
+        states[i] = state
+    said = summarise(Particles(states, np.array([0.25, 0.5, 0.25])))
+    assert said.states == 2
+    assert said.entropy == pytest.approx(math.log(2))
+
+
+class Corridor:
+    """A light is on or off, whatever the states are made of."""
+
+    actions = 2
+
+    def step(self, state, action, rng):
+        return state, int(rng.random() < 0.5), float(action), False
+
+
+@pytest.mark.parametrize("wrapped", [lambda lit: np.array([lit, 1.0]), lambda lit: {"lit": lit}])
+@pytest.mark.filterwarnings("ignore::tab_marl.planning.model.PlainPythonWarning")
+def test_a_plan_over_states_that_cannot_be_hashed_explains_itself(wrapped):
+    model = Corridor()
+    belief = ParticleFilter(model, [wrapped(0.0), wrapped(1.0)], FilterOptions(count=40), 0)
+    plan = Pomcp(model, PomcpOptions(simulations=50, max_depth=3)).plan(belief, 0)
+    assert "belief: 2 states, entropy 0.69 nats" in str(plan.explain(belief))
 
 
 def test_the_only_action_leads_by_everything():

@@ -225,8 +225,34 @@ def _as_numbers(states: Any) -> NDArray[np.float64] | None:
 def _tally(states: Any, weights: NDArray[np.float64]) -> dict[Any, float]:
     totals: dict[Any, float] = {}
     for state, weight in zip(states, weights, strict=True):
-        totals[state] = totals.get(state, 0.0) + float(weight)
+        key = _key(state)
+        totals[key] = totals.get(key, 0.0) + float(weight)
     return totals
+
+
+def _key(state: Any) -> Any:
+    """The state itself where it can be hashed, else its content in a form that can be: states are any objects."""
+    try:
+        hash(state)
+    except TypeError:
+        return (type(state), _content(state))
+    return state
+
+
+def _content(state: Any) -> Any:
+    """What a state that cannot be hashed consists of; what is of no known form goes by how it prints."""
+    if isinstance(state, np.ndarray):
+        return (
+            state.shape,
+            tuple(map(_key, state.flat)) if state.dtype.hasobject else (state.dtype.str, state.tobytes()),
+        )
+    if isinstance(state, dict):
+        return frozenset((_key(name), _key(value)) for name, value in state.items())
+    if isinstance(state, list | tuple):
+        return tuple(map(_key, state))
+    if isinstance(state, set):
+        return frozenset(state)
+    return _content(vars(state)) if hasattr(state, "__dict__") else repr(state)
 
 
 def _entropy(shares: NDArray[np.float64]) -> float:
