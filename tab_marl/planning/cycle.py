@@ -8,7 +8,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from tab_marl.planning.model import CompiledModel, ContinuousModel, check_model
+from tab_marl.planning.model import CompiledModel, ContinuousModel, check_model, numbered
 
 Belief = TypeVar("Belief")
 
@@ -78,9 +78,9 @@ def _stepper(model: Any, random: np.random.Generator) -> Callable[[Any, int], tu
     """``(state, action) -> (next state, observation, reward, terminal)`` of a model of any kind."""
     word = random.integers(2**64, size=1, dtype=np.uint64)
 
-    def numbered(state: Any, action: int) -> tuple[Any, Any, float, bool]:
+    def counted(state: Any, action: int) -> tuple[Any, Any, float, bool]:
         observation, reward, ended = model.step(state, action, model.data, word)
-        return state, int(observation), reward, ended
+        return state, numbered(observation, model.step), reward, ended
 
     def measured(state: Any, action: int) -> tuple[Any, Any, float, bool]:
         observation = np.full(model.observation_size, np.nan)
@@ -92,7 +92,7 @@ def _stepper(model: Any, random: np.random.Generator) -> Callable[[Any, int], tu
         return result
 
     if isinstance(model, CompiledModel):
-        return numbered
+        return counted
     if isinstance(model, ContinuousModel):
         return measured
     check_model(model)
