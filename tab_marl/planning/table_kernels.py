@@ -26,9 +26,11 @@ def draw(cumulative, row, rng):
 
 
 def step(state, action, data, rng):
-    """One step: next state by T(s' | s, a), observation by O(o | a, s'), reward R(s, a, s')."""
+    """One step: next state by T(s' | s, a), observation by O(o | a, s'), reward R(s, a, s'). A state that has ended earns nothing."""
     size = data.terminal.shape[0]
     before = np.int64(state[0])
+    if data.terminal[before]:
+        return np.int64(0), 0.0, True
     after = draw(data.transition, action * size + before, rng)
     observation = np.int64(draw(data.observation, action * size + after, rng))
     state[0] = after
@@ -53,13 +55,31 @@ def draw_sparse(rows, row, rng):
 def sparse_step(state, action, data, rng):
     """As `step`, from sparse tables."""
     size = data.terminal.shape[0]
-    entry = draw_sparse(data.transition, action * size + np.int64(state[0]), rng)
+    before = np.int64(state[0])
+    if data.terminal[before]:
+        return np.int64(0), 0.0, True
+    entry = draw_sparse(data.transition, action * size + before, rng)
     after = data.transition.number[entry]
     observation = data.observation.number[draw_sparse(data.observation, action * size + after, rng)]
     state[0] = after
     return np.int64(observation), data.reward[entry], data.terminal[after]
 
 
+@njit(cache=True)
+def cumulated(first, chances):
+    """Sparse cumulative probabilities: row by row, so that no row loses digits to those before it, and the last entry is 1."""
+    cumulative = np.empty(len(chances))
+    for row in range(len(first) - 1):
+        total = 0.0
+        for entry in range(first[row], first[row + 1]):
+            total += chances[entry]
+            cumulative[entry] = total
+        for entry in range(first[row], first[row + 1]):
+            cumulative[entry] /= total
+    return cumulative
+
+
 def known_state_bound(state, depth, max_depth, discount, data):
-    """The best return if the state were always known."""
-    return data.best[np.int64(state[0])]
+    """The best return of the steps left if the state were always known."""
+    row = min(max_depth - depth, data.best.shape[0]) - 1
+    return data.best[row, np.int64(state[0])]

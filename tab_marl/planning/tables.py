@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -12,6 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from tab_marl.planning import table_kernels
 from tab_marl.planning.model import CompiledModel, StateRange
+
+_MOST_VALUES = 2**22
+"""Of the known state that a model's upper bound may hold (32 MiB)."""
 
 
 class TableData(NamedTuple):
@@ -26,7 +30,7 @@ class TableData(NamedTuple):
     terminal: NDArray[np.bool_]
     """``[S]``."""
     best: NDArray[np.float64]
-    """``[S]`` best return if the state were always known; empty where no discount was given."""
+    """``[H, S]`` best return of h + 1 steps if the state were always known, the last row of any more; empty without discount."""
 
 
 class SparseRows(NamedTuple):
@@ -35,6 +39,8 @@ class SparseRows(NamedTuple):
     first: NDArray[np.int64]
     number: NDArray[np.int64]
     cumulative: NDArray[np.float64]
+    columns: int
+    """Numbers that a row is over (S states, O observations), whether or not any row holds the last of them."""
 
 
 class SparseData(NamedTuple):
@@ -59,11 +65,13 @@ def table_model(
     """A POMDP with S states, A actions and O observations as a compiled model whose state is ``[state number]``.
 
     `transition` ``[A, S, S]``: T(s' | s, a). `observation` ``[A, S, O]``: O(o | a, s'), s' the state reached. `reward`
-    ``[A, S]`` or ``[A, S, S]``: R(s, a) or R(s, a, s'). `terminal` ``[S]``: states that end the process when reached.
+    ``[A, S]`` or ``[A, S, S]``: R(s, a) or R(s, a, s'). `terminal` ``[S]``: states that end the process when reached;
+    a belief may hold one, from which every action earns nothing and ends at once, whatever the state's own rows say.
     Sparse: `transition` and `observation` are each a sequence of A scipy.sparse matrices (then so may `reward` be, for
     R(s, a, s'), of which entries that no transition reaches are not read). `discount` gives the model an upper bound for
-    DESPOT: the best return if the state were always known, by value iteration.
-    Raises ValueError when shapes disagree or a row is not a distribution.
+    DESPOT at that discount: the best return of the steps left if the state were always known, by value iteration.
+    Raises ValueError when shapes disagree or a row is not a distribution: a sum may be off by what the rounding of the table's
+    own type explains (1e-9 in double precision), and is made 1.
     """
     sparse = [_is_sparse(transition), _is_sparse(observation)]
     if any(sparse) and not all(sparse):
@@ -108,13 +116,15 @@ def _dense_model(
         _cumulative(o).reshape(actions * states, o.shape[2]),
         np.ascontiguousarray(r).reshape(actions * states, states),
         ends,
-        _known_state_values(list(t), mean, ends, discount),
+        _best_returns(list(t), mean, ends, discount),
     )
     return _bounded(CompiledModel(table_kernels.step, actions, 1, data, action_names=action_names), discount)
 
 
 def _bounded(model: CompiledModel, discount: float | None) -> CompiledModel:
-    return model if discount is None else replace(model, upper=table_kernels.known_state_bound)
+    if discount is None:
+        return model
+    return replace(model, upper=table_kernels.known_state_bound, upper_discount=discount)
 
 
 def _rewards(reward: ArrayLike, actions: int, states: int) -> NDArray[np.float64]:
@@ -135,22 +145,34 @@ def _terminal(terminal: ArrayLike | None, states: int) -> NDArray[np.bool_]:
     return ends
 
 
-def _known_state_values(
+def _best_returns(
     transition: list[Any], mean_reward: NDArray[np.float64], ends: NDArray[np.bool_], discount: float | None
 ) -> NDArray[np.float64]:
-    """``[S]`` best returns with the state known: value iteration to 1e-9 from above, which leaves an upper bound."""
+    """``[H, S]``: row h is the best return of h + 1 steps with the state known; the last bounds those of all more steps too.
+
+    Value iteration until another step changes nothing. Where steps cost, few are worth more than many, so that no horizon's
+    values bound another's: each has its row as long as `_MOST_VALUES` hold them, and the last is the greatest of the rest.
+    """
     if discount is None:
-        return np.empty(0)
-    values = np.full(len(ends), max(0.0, float(mean_reward.max())) / (1 - discount))
+        return np.empty((0, len(ends)))
+    most = max(1, _MOST_VALUES // len(ends))
+    rows: list[NDArray[np.float64]] = []
+    values = np.zeros(len(ends))
     for _ in range(100_000):
-        going = np.where(ends, 0.0, values)
-        before, values = (
-            values,
-            np.max([mean_reward[a] + discount * (t @ going) for a, t in enumerate(transition)], axis=0),
-        )
-        if np.abs(before - values).max() < 1e-9:
+        before = values
+        backed_up = [mean_reward[a] + discount * (t @ before) for a, t in enumerate(transition)]
+        values = np.where(ends, 0.0, np.max(backed_up, axis=0))
+        if len(rows) < most:
+            rows.append(values)
+        else:
+            rows[-1] = np.maximum(rows[-1], values)
+        gain = values - before
+        if np.abs(gain).max() <= max(1e-9 * (1 - discount), 8 * np.spacing(np.abs(values).max())):
             break
-    return values
+    # What is still to be gained: the next step gains at most `discount` times as much as this one did, and so on.
+    left = max(0.0, float(gain.max())) * discount / (1 - discount)
+    rows[-1] = np.where(ends, 0.0, rows[-1] + left)
+    return np.array(rows)
 
 
 def _sparse_model(
@@ -162,14 +184,13 @@ def _sparse_model(
     discount: float | None,
 ) -> CompiledModel:
     actions, states = len(transition), transition[0].shape[0]
-    t = [scipy.sparse.csr_array(m, dtype=np.float64) for m in transition]
-    o = [scipy.sparse.csr_array(m, dtype=np.float64) for m in observation]
+    t, o = list(transition), list(observation)
     if any(m.shape != (states, states) for m in t):
         raise ValueError(f"transition has shapes {[m.shape for m in t]}, must be A times [{states}, {states}]")
     if len(o) != actions or any(m.shape != (states, o[0].shape[1]) for m in o):
         raise ValueError(f"observation has shapes {[m.shape for m in o]}, must be {actions} times [{states}, O]")
-    rows = _sparse_rows("transition", t, "T(. | state, action)")
-    seen = _sparse_rows("observation", o, "O(. | action, state reached)")
+    t, rows = _sparse_distributions("transition", t, "T(. | state, action)")
+    _, seen = _sparse_distributions("observation", o, "O(. | action, state reached)")
     before = np.repeat(np.arange(actions * states), np.diff(rows.first))
     if _is_sparse(reward):
         if len(reward) != actions or any(m.shape != (states, states) for m in reward):
@@ -186,49 +207,74 @@ def _sparse_model(
     probabilities = scipy.sparse.csr_array(scipy.sparse.vstack(t))
     totals = np.bincount(before, probabilities.data * entries, minlength=actions * states).astype(np.float64)
     mean = totals.reshape(actions, states)
-    data = SparseData(rows, seen, np.ascontiguousarray(entries), ends, _known_state_values(t, mean, ends, discount))
+    data = SparseData(rows, seen, np.ascontiguousarray(entries), ends, _best_returns(t, mean, ends, discount))
     return _bounded(CompiledModel(table_kernels.sparse_step, actions, 1, data, action_names=action_names), discount)
 
 
-def _sparse_rows(name: str, matrices: list[Any], meaning: str) -> SparseRows:
-    for matrix in matrices:
-        matrix.sum_duplicates()
-        matrix.eliminate_zeros()
-    rows = scipy.sparse.csr_array(scipy.sparse.vstack(matrices))
-    states = matrices[0].shape[0]
-    first = rows.indptr.astype(np.int64)
-    sums = np.asarray(rows.sum(axis=1)).ravel()
-    negative = np.zeros(len(sums), dtype=np.bool_)
-    negative[np.repeat(np.arange(len(sums)), np.diff(first))[rows.data < 0]] = True
-    bad = negative | ~np.isclose(sums, 1.0, rtol=0.0, atol=1e-9)
-    if bad.any():
-        action, state = divmod(int(np.argmax(bad)), states)
-        raise ValueError(
-            f"{name}[{action}][{state}] = {meaning} is not a distribution: sum {sums[np.argmax(bad)]:g}"
-            f"{', with a negative entry' if negative[np.argmax(bad)] else ''}, must be >= 0 and sum to 1"
-        )
-    total = np.cumsum(rows.data)
-    cumulative = total - np.repeat(np.concatenate([[0.0], total])[first[:-1]], np.diff(first))
-    cumulative[first[1:] - 1] = 1.0
-    return SparseRows(first, rows.indices.astype(np.int64), np.minimum(cumulative, 1.0))
+def _sparse_distributions(name: str, matrices: list[Any], meaning: str) -> tuple[list[Any], SparseRows]:
+    """(the matrices with rows that sum to 1, the same as cumulative rows); the caller's own stay as they are."""
+    states, columns = matrices[0].shape
+    allowed = max(_rounding(m.dtype, columns) for m in matrices)
+    table = scipy.sparse.csr_array(scipy.sparse.vstack(matrices, format="csr"), dtype=np.float64, copy=True)
+    table.sum_duplicates()
+    table.eliminate_zeros()
+    first, sizes = table.indptr.astype(np.int64), np.diff(table.indptr)
+    least = np.asarray(table.min(axis=1).todense(), dtype=np.float64).ravel()
+    sums = np.asarray(table.sum(axis=1), dtype=np.float64).ravel()
+    _check_rows(least, sums, allowed, lambda row: f"{name}[{row // states}][{row % states}] = {meaning}")
+    table.data /= np.repeat(sums, sizes)
+    cumulative = table_kernels.cumulated(first, table.data)
+    rows = SparseRows(first, table.indices.astype(np.int64), cumulative, int(columns))
+    return [table[at : at + states] for at in range(0, table.shape[0], states)], rows
 
 
 def _distributions(name: str, table: ArrayLike, meaning: str) -> NDArray[np.float64]:
-    rows = np.asarray(table, dtype=np.float64)
-    if rows.ndim != 3:
-        raise ValueError(f"{name} has {rows.ndim} dimensions, must have 3")
-    bad = (rows < 0).any(axis=2) | ~np.isclose(rows.sum(axis=2), 1.0, rtol=0.0, atol=1e-9)
-    if bad.any():
-        action, state = (int(i) for i in np.argwhere(bad)[0])
+    given = np.asarray(table)
+    if given.ndim != 3:
+        raise ValueError(f"{name} has {given.ndim} dimensions, must have 3")
+    rows = given.astype(np.float64)
+    sums, states = rows.sum(axis=2), rows.shape[1]
+    allowed = _rounding(given.dtype, rows.shape[2])
+    least = rows.min(axis=2, initial=np.inf)
+    _check_rows(least.ravel(), sums.ravel(), allowed, lambda r: f"{name}[{r // states}, {r % states}] = {meaning}")
+    return rows / sums[:, :, None]
+
+
+def _rounding(kind: Any, columns: int) -> float:
+    """By how much the sum of so many probabilities may be off 1 for no other reason than that their type is coarse."""
+    precision = float(np.finfo(kind).eps) if np.issubdtype(kind, np.floating) else 0.0
+    return max(1e-9, 4 * precision * math.sqrt(columns))
+
+
+def _check_rows(
+    least: NDArray[np.float64], sums: NDArray[np.float64], allowed: float, named: Callable[[int], str]
+) -> None:
+    """ValueError naming the first row that is not a distribution."""
+    bad = np.flatnonzero(~((least >= 0) & (np.abs(sums - 1) <= allowed)))
+    if len(bad) > 0:
+        row = int(bad[0])
         raise ValueError(
-            f"{name}[{action}, {state}] = {meaning} is not a distribution: "
-            f"least entry {rows[action, state].min():g}, sum {rows[action, state].sum():g}, must be >= 0 and sum to 1"
+            f"{named(row)} is not a distribution: least entry {least[row]:g}, sum - 1 = {sums[row] - 1:.3g}; entries must be "
+            f">= 0 and sum to 1 within {allowed:.2g}: divide the row by its sum if that is rounding"
         )
-    return rows
 
 
 def _cumulative(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Cumulative sums whose last *possible* entry is exactly 1, so that no draw can land on an impossible one."""
+    """Cumulative sums that never fall and whose last *possible* entry is exactly 1: no draw can land on an impossible one."""
     total = np.cumsum(rows, axis=2)
-    total[total >= total[:, :, -1:]] = 1.0
-    return np.ascontiguousarray(total)
+    return np.ascontiguousarray(total / total[:, :, -1:])
+
+
+def reward_range(data: TableData | SparseData) -> tuple[float, float]:
+    """(least, greatest) reward of a step that can happen; an ended process, where there can be one, earns 0."""
+    size = len(data.terminal)
+    if isinstance(data, SparseData):
+        before = np.repeat(np.arange(len(data.transition.first) - 1), np.diff(data.transition.first))
+        met = data.reward[~data.terminal[before % size]]
+    else:
+        possible = np.diff(data.transition, axis=1, prepend=0.0) > 0
+        goes_on = ~np.tile(data.terminal, len(possible) // size)
+        met = data.reward[possible & goes_on[:, None]]
+    if data.terminal.any():
+        met = np.append(met, 0.0)
+    return float(met.min()), float(met.max())

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 import pytest
+import scipy.sparse
 from scipy.optimize import linprog
 
 from tab_marl.planning.model import Particles
@@ -24,13 +25,14 @@ def solve(transition, observation, reward, terminal, discount, horizon):
     states = len(terminal)
     if reward.ndim == 3:
         reward = (transition * reward).sum(axis=2)
+    goes_on = ~terminal
     vectors, actions = np.zeros((1, states)), np.zeros(1, dtype=int)
     for _ in range(horizon):
         made, by = [], []
         for a in range(len(transition)):
-            total = reward[a][None]
+            total = (reward[a] * goes_on)[None]
             for o in range(observation.shape[2]):
-                reach = transition[a] * (observation[a][:, o] * ~terminal)
+                reach = goes_on[:, None] * transition[a] * (observation[a][:, o] * goes_on)
                 sums = total[:, None] + (discount * vectors @ reach.T)[None]
                 total = pruned(sums.reshape(-1, states))[0]
             made.append(total)
@@ -99,7 +101,7 @@ def test_the_solver_solves_what_can_be_worked_out_by_hand():
     third = agree * (10 * 0.85**2 - 100 * 0.15**2) / agree - (1 - agree)
     assert best == pytest.approx([-1.0, -1.95, -1.95 + 0.95**2 * third])
     first = solve(*random_pomdp(0), 0.9, 1)[0]
-    mean = (random_pomdp(0)[0] * random_pomdp(0)[2]).sum(axis=2)
+    mean = (random_pomdp(0)[0] * random_pomdp(0)[2]).sum(axis=2) * [1, 1, 1, 0]  # in the last state it is over
     for belief in np.random.default_rng(0).dirichlet(np.ones(4), size=20):
         assert (first @ belief).max() == pytest.approx((mean @ belief).max())
 
@@ -124,12 +126,25 @@ def test_random_pomdps_with_an_end_are_worth_what_the_exact_solver_says(seed):
     vectors, actions = solve(*pomdp, 0.9, 4)
     options = PomcpOptions(simulations=100_000, exploration=3.0, discount=0.9, max_depth=4)
     planner = Pomcp(table_model(*pomdp), options)
-    for belief in np.random.default_rng(seed).dirichlet(np.ones(3), size=3):
-        known = np.append(belief, 0.0)
+    beliefs = np.random.default_rng(seed).dirichlet(np.ones(3), size=3)
+    for ended, belief in zip((0.0, 0.0, 0.4), beliefs, strict=True):
+        known = np.append(belief * (1 - ended), ended)  # the process may be over already: nothing is earned there
         worth = vectors @ known
         plan = planner.plan(Particles(np.arange(4.0), known), seed)
         assert worth.max() - 0.05 < plan.values[plan.action] < worth.max() + 0.02
         assert worth[actions == plan.action].max(initial=-np.inf) > worth.max() - 0.02  # the best action, or as good
+
+
+@pytest.mark.parametrize("kind", ["dense", "sparse"])
+def test_where_the_process_is_over_nothing_is_earned(kind):
+    transition, observation, reward, terminal = random_pomdp(2)
+    reward = reward + 50.0
+    if kind == "sparse":
+        transition, observation = ([scipy.sparse.csr_array(m) for m in t] for t in (transition, observation))
+    model = table_model(transition, observation, reward, terminal)
+    plan = Pomcp(model, PomcpOptions(simulations=200, max_depth=4)).plan([3.0], 0)
+    assert plan.values.tolist() == [0.0, 0.0, 0.0]
+    assert plan.depth == 1
 
 
 @heavy
