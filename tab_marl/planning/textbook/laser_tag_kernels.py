@@ -98,5 +98,6 @@ def seen_leaf(state, action, observation, depth, max_depth, discount, data, rng)
 
 def seen_value(state, depth, max_depth, discount, data):
     """The same as an upper bound, at discount .95: a chase cut short is spared no more than the worst chase costs."""
-    spared = discount ** (max_depth - depth) * min(0.0, data.least_seen)
+    # A whole exponent is multiplied out where this is compiled and not where it runs interpreted, which differ in the last bit.
+    spared = discount ** np.float64(max_depth - depth) * min(0.0, data.least_seen)
     return data.seen_values[np.int64(state[0]) * data.cells + np.int64(state[1])] - spared

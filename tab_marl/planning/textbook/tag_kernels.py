@@ -106,8 +106,9 @@ def preferred(state, action, observation, depth, data, values, counts):
         counts[TAG] = 10
         return
     robot = np.int64(state[0])
+    last = action if action >= 0 else TAG  # at the start nothing can be doubled back on, as after a tag
     for slot in range(ROLLOUT_SLOTS):
-        move = np.int64(data.rollout_moves[(robot * 5 + action) * ROLLOUT_SLOTS + slot])
+        move = np.int64(data.rollout_moves[(robot * 5 + last) * ROLLOUT_SLOTS + slot])
         values[move >> 5] = 0.0
         counts[move >> 5] = 10
 
@@ -117,5 +118,6 @@ def seen_value(state, depth, max_depth, discount, data):
 
     A chase cut short is spared what would follow, which costs no more than the worst chase does.
     """
-    spared = discount ** (max_depth - depth) * min(0.0, data.least_seen)
+    # A whole exponent is multiplied out where this is compiled and not where it runs interpreted, which differ in the last bit.
+    spared = discount ** np.float64(max_depth - depth) * min(0.0, data.least_seen)
     return data.seen_values[np.int64(state[0]) * CELLS + np.int64(state[1])] - spared
