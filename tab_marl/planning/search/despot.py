@@ -6,7 +6,7 @@ was found better) and an upper bound; trials go where they are furthest apart. `
 rng)`` returns the same `Plan` as `tab_marl.planning.search.pomcp.Pomcp`.
 
 The default policy is the model's ``rollout`` (it must go by the history alone), or uniformly random actions. The upper bound is
-the model's ``upper``, or the greatest reward at every step, from ``reward_bounds``.
+the model's ``upper``, which may hold for one discount only, or the greatest reward at every step, from ``reward_bounds``.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from tab_marl.planning.model import (
 from tab_marl.planning.search import despot_kernels as kernels
 from tab_marl.planning.search.bounds import Depths, check_horizon, require
 from tab_marl.planning.search.despot_interpreted import search_in_python
+from tab_marl.planning.search.despot_rewards import check_met, check_promises, trivial_rewards
 from tab_marl.planning.search.growing import Chunks, grown, table_size
 from tab_marl.planning.search.kernels import UNEXPANDED
 from tab_marl.planning.search.plan import Plan, Search, Stopped, action_numbers, decided
@@ -84,7 +85,8 @@ class DespotOptions(Depths):
     gap: float = 1e-3
     """The search is done when the root's bounds are this close."""
     reward_bounds: tuple[float, float] | None = None
-    """(least, greatest) reward of a step: trivial bounds. The greatest is needed where the model has no ``upper``."""
+    """(least, greatest) reward of a step: trivial bounds. The greatest is needed where the model has no ``upper``. A reward
+    outside is an error (one of 0 never is): said at once of tables, after the search of other models."""
     lower: Literal["rollout", "trivial"] = "rollout"
     """The first lower bound: the default policy simulated, or the least reward for ever."""
     max_nodes: int = 1_000_000
@@ -147,6 +149,7 @@ class Despot:
                 "the model has no upper bound: give it `upper`, or give DespotOptions reward_bounds, the (least, greatest) "
                 "reward of a step"
             )
+        check_promises(self.model, options)
 
     def plan(self, belief: Any, rng: np.random.Generator | int, *, allowed: ArrayLike | None = None) -> Plan:
         """Searches from `belief` (states, `Particles`, a filter or a sampler) and returns the plan; `allowed` restricts the root.
@@ -192,7 +195,7 @@ def _search_compiled(
     began = time.perf_counter()
     step, rollout, _ = model.functions
     total, actions, horizon = options.scenarios, model.actions, options.horizon
-    least, greatest = options.reward_bounds or (0.0, 0.0)
+    least, greatest = trivial_rewards(model, options)
     node_cap, row_cap = options.max_nodes, max(options.max_rows, total * (actions + 1))
     room = total * actions
     nodes = np.empty(min(node_cap, 1 + _FIRST_EXPANSIONS * room), dtype=DESPOT_NODE)
@@ -203,7 +206,7 @@ def _search_compiled(
     row_states[:total], row_scenarios[:total] = states[start], np.arange(total)
     used = np.zeros(9, dtype=np.int64)
     used[kernels.ROWS], used[kernels.GREW] = total, 1
-    path = np.zeros(horizon + 1, dtype=np.int64)
+    met, path = np.array([math.inf, -math.inf]), np.zeros(horizon + 1, dtype=np.int64)
     slots = np.empty(table_size(total), dtype=np.int32)
     moved, moved_to = np.empty((total, model.state_size)), np.empty((total, 2), dtype=np.int32)
     stream, model_stream, state = np.zeros(1, np.uint64), np.zeros(1, np.uint64), np.empty(model.state_size)
@@ -213,15 +216,15 @@ def _search_compiled(
         nodes["first_row"][ROOT], nodes["scenarios"][ROOT] = 0, scenarios
         kernels.bound_node(
             step, rollout, upper, trivial, least, greatest, model.data, seeds, 0, -1, actions, horizon, options.discount,
-            powers, options.regularisation, nodes, row_states, row_scenarios, used, stream, model_stream, state,
+            powers, options.regularisation, nodes, row_states, row_scenarios, used, met, stream, model_stream, state,
         )  # fmt: skip
 
     def run(trials: int, expansions: int) -> int:
         result: int = kernels.search(
             step, rollout, upper, trivial, least, greatest, model.data, seeds, root_actions, actions, horizon,
             options.deepest_node, options.discount, powers, options.regularisation, options.share, options.gap,
-            trials, expansions, nodes, edges, edge_actions, row_states, row_scenarios, used, path, slots, moved, moved_to,
-            stream, model_stream, state,
+            trials, expansions, nodes, edges, edge_actions, row_states, row_scenarios, used, met, path, slots, moved,
+            moved_to, stream, model_stream, state,
         )  # fmt: skip
         return result
 
@@ -251,6 +254,7 @@ def _search_compiled(
         if chunks.over(time.perf_counter() - at, max(1, int(used[kernels.EXPANSIONS]) - before)):
             stopped = "seconds"
             break
+    check_met(model, options, *met.tolist())
     kernels.back_up_path(nodes, edges, options.regularisation, path, used)
     return finished(
         nodes[: used[kernels.NODES]], edges[: used[kernels.EDGES]], edge_actions[: used[kernels.EDGES]].copy(),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import time
 from collections.abc import Hashable
 from dataclasses import dataclass, field
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from tab_marl.planning.model import CompiledModel, belief_objects, belief_states
 from tab_marl.planning.search import despot_kernels as kernels
+from tab_marl.planning.search.despot_rewards import check_met, trivial_rewards
 from tab_marl.planning.search.interpreted import Stream, mixed
 from tab_marl.planning.search.kernels import NO_CHILD, UNEXPANDED
 from tab_marl.planning.search.plan import Search, Stopped
@@ -111,10 +113,14 @@ class _Search:
         self.expansions = self.steps = self.deepest = self.trials = 0
         self.has_rollout = getattr(model, "rollout", None) is not None
         self.has_upper = getattr(model, "upper", None) is not None
+        self.bounds, self.met = trivial_rewards(model, options), [math.inf, -math.inf]
 
     def add(self, depth: int, seen: Any) -> _Node:
         self.nodes.append(_Node(len(self.nodes), depth, seen))
         return self.nodes[-1]
+
+    def meet(self, reward: float) -> None:
+        self.met = [min(self.met[0], reward), max(self.met[1], reward)]
 
     def trivial(self, reward: float, depth: int) -> float:
         discount = self.options.discount
@@ -132,6 +138,7 @@ class _Search:
         for _ in range(depth, self.horizon):
             state, _seen, reward, terminal = self.source.step(state, stream.below(self.model.actions))
             self.steps += 1
+            self.meet(reward)
             total += weight * reward
             if terminal:
                 break
@@ -139,7 +146,7 @@ class _Search:
         return total
 
     def bound(self, node: _Node, action: int) -> None:
-        least, greatest = self.options.reward_bounds or (0.0, 0.0)
+        least, greatest = self.bounds
         low = high = 0.0
         for state, scenario in node.held:
             high += (
@@ -167,6 +174,7 @@ class _Search:
             for state, scenario in node.held:
                 self.source.seed(self.seeds[scenario], node.depth)
                 after, seen, reward, terminal = self.source.step(state, edge.action)
+                self.meet(reward)
                 total += reward
                 if terminal or node.depth + 1 >= self.horizon:
                     continue
@@ -194,7 +202,9 @@ class _Search:
                 edge.upper += child.upper
                 edge_raw += child.raw
             low, high, raw = max(low, edge.lower), max(high, edge.upper), max(raw, edge_raw)
-        node.lower, node.upper, node.raw = max(node.lower, low), min(node.upper, high), min(node.raw, raw)
+        node.lower = max(node.lower, low)
+        node.upper = max(node.lower, min(node.upper, high))
+        node.raw = max(node.lower, min(node.raw, raw))
 
     def pruned(self, path: list[_Node]) -> bool:
         at, penalty = len(path) - 1, self.options.regularisation
@@ -265,6 +275,7 @@ def search_in_python(
     with np.errstate(over="ignore"):  # a model's random words wrap round
         search.bound(root, -1)
         stopped = search.run(None if options.seconds is None else time.perf_counter() + options.seconds)
+    check_met(model, options, *search.met)
     nodes, edges = np.zeros(len(search.nodes), dtype=DESPOT_NODE), np.zeros(len(search.edges), dtype=DESPOT_EDGE)
     nodes["sibling"] = edges["child"] = NO_CHILD
     for i, node in enumerate(search.nodes):

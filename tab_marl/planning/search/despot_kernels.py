@@ -30,9 +30,16 @@ def seed_rng(rng, seed, depth):
 
 
 @njit(cache=True, nogil=True)
+def meet(met, reward):
+    """Keeps the least and the greatest reward of all steps, to be held against what was promised."""
+    met[0] = min(met[0], reward)
+    met[1] = max(met[1], reward)
+
+
+@njit(cache=True, nogil=True)
 def default_value(
-    step, rollout, data, state, action, observation, depth, max_depth, discount, actions, seed, rng, model_rng, used
-):
+    step, rollout, data, state, action, observation, depth, max_depth, discount, actions, seed, rng, model_rng, used, met,
+):  # fmt: skip
     """The scenario's return under the default policy: the model's rollout, or uniformly random actions."""
     seed_rng(model_rng, seed, depth)
     if rollout is not None:
@@ -44,6 +51,7 @@ def default_value(
         for _ in range(depth, max_depth):
             _observation, reward, terminal = step(state, below(rng, actions), data, model_rng)
             used[STEPS] += 1
+            meet(met, reward)
             total += weight * reward
             if terminal:
                 break
@@ -62,7 +70,7 @@ def trivial_bound(reward, steps, discount, powers):
 @njit(cache=True, nogil=True)
 def bound_node(
     step, rollout, upper, trivial, least, greatest, data, seeds, node, action, actions, max_depth, discount, powers,
-    penalty, nodes, row_states, row_scenarios, used, rng, model_rng, state,
+    penalty, nodes, row_states, row_scenarios, used, met, rng, model_rng, state,
 ):  # fmt: skip
     """First bounds of a node from its scenarios: the default policy's return, and what no policy can exceed."""
     depth = nodes[node]["depth"]
@@ -80,7 +88,7 @@ def bound_node(
         else:
             state[:] = row_states[row]
             low += default_value(step, rollout, data, state, action, observation, depth, max_depth, discount, actions,
-                                 seeds[row_scenarios[row]], rng, model_rng, used)  # fmt: skip
+                                 seeds[row_scenarios[row]], rng, model_rng, used, met)  # fmt: skip
     scale = powers[depth] / len(seeds)
     nodes[node]["default"] = scale * low
     nodes[node]["lower"] = scale * low
@@ -107,7 +115,7 @@ def add_node(nodes, used, depth, edge, observation, sibling):
 @njit(cache=True, nogil=True)
 def expand(
     step, rollout, upper, trivial, least, greatest, data, seeds, node, root_actions, actions, max_depth, discount, powers,
-    penalty, nodes, edges, edge_actions, row_states, row_scenarios, used, slots, moved, moved_to, rng, model_rng, state,
+    penalty, nodes, edges, edge_actions, row_states, row_scenarios, used, met, slots, moved, moved_to, rng, model_rng, state,
 ):  # fmt: skip
     """Steps every scenario of the node by every action and gathers them by observation into new nodes with first bounds.
 
@@ -137,6 +145,7 @@ def expand(
             state[:] = row_states[row]
             seed_rng(model_rng, seeds[scenario], depth)
             observation, reward, terminal = step(state, action, data, model_rng)
+            meet(met, reward)
             total += reward
             if terminal or depth + 1 >= max_depth:
                 continue
@@ -168,14 +177,15 @@ def expand(
         child = newest
         while child >= 0:
             bound_node(step, rollout, upper, trivial, least, greatest, data, seeds, child, action, actions, max_depth,
-                       discount, powers, penalty, nodes, row_states, row_scenarios, used, rng, model_rng, state)  # fmt: skip
+                       discount, powers, penalty, nodes, row_states, row_scenarios, used, met, rng, model_rng, state)  # fmt: skip
             child = nodes[child]["sibling"]
     used[DEEPEST] = max(used[DEEPEST], depth + 1)
 
 
 @njit(cache=True, nogil=True)
 def back_up(nodes, edges, penalty, node):
-    """Bellman's equation for the node's bounds; they only ever tighten."""
+    """Bellman's equation for the node's bounds. The lower bound only rises and the upper one falls, unless the lower one passes
+    it: an upper bound holds on average, and what was earned on these scenarios may be luckier."""
     if nodes[node]["first_edge"] == UNEXPANDED:
         return
     low = nodes[node]["default"]
@@ -197,8 +207,8 @@ def back_up(nodes, edges, penalty, node):
         high = max(high, edge_high)
         raw = max(raw, edge_raw)
     nodes[node]["lower"] = max(nodes[node]["lower"], low)
-    nodes[node]["upper"] = min(nodes[node]["upper"], high)
-    nodes[node]["raw"] = min(nodes[node]["raw"], raw)
+    nodes[node]["upper"] = max(nodes[node]["lower"], min(nodes[node]["upper"], high))
+    nodes[node]["raw"] = max(nodes[node]["lower"], min(nodes[node]["raw"], raw))
 
 
 @njit(cache=True, nogil=True)
@@ -235,7 +245,7 @@ def excess(nodes, node, total, target):
 def search(
     step, rollout, upper, trivial, least, greatest, data, seeds, root_actions, actions, max_depth, tree_depth, discount,
     powers, penalty, share, gap, trials, expansions,
-    nodes, edges, edge_actions, row_states, row_scenarios, used, path, slots, moved, moved_to, rng, model_rng, state,
+    nodes, edges, edge_actions, row_states, row_scenarios, used, met, path, slots, moved, moved_to, rng, model_rng, state,
 ):  # fmt: skip
     """Trials from the root until `trials` in all are done, `expansions` more nodes are expanded, the root's gap is closed, or
     the arrays might not hold the next expansion. Goes on in the middle of a trial when called again."""
@@ -275,7 +285,7 @@ def search(
                 used[GREW] = 1
                 return BUDGET
             expand(step, rollout, upper, trivial, least, greatest, data, seeds, node, root_actions, actions, max_depth,
-                   discount, powers, penalty, nodes, edges, edge_actions, row_states, row_scenarios, used, slots, moved,
+                   discount, powers, penalty, nodes, edges, edge_actions, row_states, row_scenarios, used, met, slots, moved,
                    moved_to, rng, model_rng, state)  # fmt: skip
             used[EXPANSIONS] += 1
             used[GREW] = 1
