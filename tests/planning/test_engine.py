@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import subprocess
 import sys
+import time
 import warnings
 
 import numba
@@ -16,15 +17,13 @@ import scipy.sparse
 from tab_marl.planning import (
     Despot,
     DespotOptions,
-    ParticleFilter,
-    Particles,
     Pomcp,
     PomcpOptions,
     Pomcpow,
     PomcpowOptions,
     textbook,
 )
-from tab_marl.planning.model import CompiledModel, ContinuousModel, PlainPythonWarning, StateRange, check_states
+from tab_marl.planning.model import CompiledModel, PlainPythonWarning
 from tab_marl.planning.random_kernels import below
 from tab_marl.planning.search.tree import ROOT
 from tab_marl.planning.tables import table_model
@@ -82,6 +81,47 @@ def test_time_may_end_a_search_first():
     plan = Pomcp(textbook.tag(), PomcpOptions(simulations=10**9, seconds=0.03, max_nodes=500)).plan(tag_belief(), 7)
     assert (plan.stopped, plan.full, len(plan.tree)) == ("seconds", True, 500)
     assert plan.visits.sum() == plan.simulations < 10**9
+
+
+def few_at_a_time(count, rng):
+    """A sampler that could not draw a million states in an hour."""
+    assert count <= 2048, "asked for more than the time allows"
+    return np.column_stack([np.full(count, 4), rng.integers(29, size=count)])
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_sampler_is_asked_within_the_time(workers, compiled):
+    options = PomcpOptions(simulations=10**7, seconds=0.02, max_nodes=500, workers=workers, compiled=compiled)
+    plan = Pomcp(textbook.tag(), options).plan(few_at_a_time, 0)
+    assert plan.stopped == "seconds"
+    assert 1 <= plan.simulations < 10**7
+    wide = PomcpowOptions(simulations=10**7, seconds=0.02, max_nodes=500, workers=workers, compiled=compiled)
+    dark = lambda count, rng: few_at_a_time(count, rng)[:, 1:]
+    assert Pomcpow(textbook.light_dark(), wide).plan(dark, 0).stopped == "seconds"
+
+
+def test_a_sampler_that_takes_all_the_time_leaves_a_plan():
+    def slow(count, rng):
+        time.sleep(0.05)
+        return few_at_a_time(count, rng)
+
+    plan = Pomcp(textbook.tag(), PomcpOptions(simulations=10**6, seconds=0.03)).plan(slow, 0)
+    assert plan.stopped == "seconds"
+    assert 1 <= plan.simulations <= 2048
+
+
+@pytest.mark.parametrize("scenarios", [False, True])
+def test_the_twin_of_a_sampler_under_a_clock(scenarios, same_tree):
+    options = PomcpOptions(simulations=4500, seconds=600.0, common_random_numbers=scenarios, max_depth=8, tree_depth=3)
+    fast = Pomcp(textbook.tag(), options).plan(few_at_a_time, 1)
+    slow = Pomcp(textbook.tag(), dataclasses.replace(options, compiled=False)).plan(few_at_a_time, 1)
+    assert same_tree(fast.tree, slow.tree)
+    assert fast.visits.sum() == 4500
+    few = dataclasses.replace(options, simulations=2000)
+    timeless = dataclasses.replace(few, seconds=None)
+    timed, untimed = (Pomcp(textbook.tag(), o).plan(few_at_a_time, 1) for o in (few, timeless))
+    assert same_tree(timed.tree, untimed.tree)
 
 
 # ---- several cores
@@ -219,9 +259,13 @@ def test_sparse_tables_are_the_dense_ones(rewards, same_tree):
 def test_known_state_values_solve_bellmans_equation():
     transition, observation, reward, terminal = grid_tables()
     best = table_model(transition, observation, reward, terminal, discount=0.9).data.best
-    going = np.where(terminal, 0.0, best)
-    backed_up = [(transition[a] * (reward[a] + 0.9 * going)).sum(axis=1) for a in range(2)]
-    assert best == pytest.approx(np.max(backed_up, axis=0), abs=1e-8)
+    assert (best[:, terminal] == 0).all()
+    for steps in range(len(best)):  # of one step, of two, ..., of any more
+        after = best[steps - 1] if steps > 0 else np.zeros(36)
+        backed_up = [(transition[a] * (reward[a] + 0.9 * after)).sum(axis=1) for a in range(2)]
+        assert best[steps] == pytest.approx(np.where(terminal, 0.0, np.max(backed_up, axis=0)), abs=1e-8)
+    backed_up = [(transition[a] * (reward[a] + 0.9 * best[-1])).sum(axis=1) for a in range(2)]
+    assert best[-1] == pytest.approx(np.where(terminal, 0.0, np.max(backed_up, axis=0)), abs=1e-8)
 
 
 @pytest.mark.parametrize(
@@ -311,57 +355,6 @@ def test_every_search_answers_in_the_same_form():
         assert plan.depth >= 1
         assert plan.best_line()
         assert plan.tree.nodes["visits"][ROOT] >= plan.visits.max()
-
-
-# ---- what is no state is refused, not looked up
-
-
-@pytest.mark.parametrize(
-    ("model", "belief", "words"),
-    [
-        (
-            textbook.tiger(),
-            [0.99, 0.01],
-            r"state 0 of the belief is \[0.99\]: its number 0 must be whole and in \[0, 1\]",
-        ),
-        (
-            textbook.tiger(),
-            [0.0, 7.0],
-            r"state 1 of the belief is \[7.0\].* not of probabilities: give those as weights",
-        ),
-        (textbook.tiger(), [-1.0], r"in \[0, 1\] for this model"),
-        (textbook.tag(), [[3, 40]], r"its number 1 must be whole and in \[0, 28\]"),
-        (textbook.tag(), [[99, 3]], r"its number 0 must be whole and in \[0, 28\]"),
-        (textbook.tag(), [[3, np.nan]], "its number 1 must be whole"),
-        (textbook.laser_tag(), [[3, 69]], r"in \[0, 68\]"),
-        (textbook.rock_sample(4, 4), [[16, 0, 0, 0, 0, 0]], r"number 0 must be whole and in \[0, 15\]"),
-        (textbook.rock_sample(4, 4), [[0, 16, 0, 0, 0, 0]], r"number 1 must be whole and in \[0, 15\]"),
-        (textbook.rock_sample(4, 4), [[0, 0, 0.5, 0, np.nan, 0]], r"number 4 must be in \[-inf, inf\]"),
-        (textbook.light_dark(), [61.0], r"whole and in \[-60, 60\]"),
-        (textbook.light_dark_binned(), [0.5], r"whole and in \[-60, 60\]"),
-    ],
-)
-def test_a_belief_in_what_is_no_state_is_refused_by_searches_and_filters(model, belief, words):
-    search = (
-        Pomcpow(model, PomcpowOptions(simulations=2))
-        if isinstance(model, ContinuousModel)
-        else Pomcp(model, PomcpOptions(simulations=2))
-    )
-    for given in (belief, Particles(np.array(belief)), lambda count, rng: np.array(belief)):
-        with pytest.raises(ValueError, match=words):
-            search.plan(given, 0)
-        with pytest.raises(ValueError, match=words):
-            ParticleFilter(model, given)
-
-
-def test_the_range_of_states_is_one_of_every_number_in_a_state():
-    with pytest.raises(ValueError, match="states gives the range of 2 numbers, must be of state_size = 1"):
-        CompiledModel(lottery_step, 3, 1, states=StateRange([0, 0], [1, 1]))
-    half_open = CompiledModel(lottery_step, 3, 2, states=StateRange([0, -np.inf], [np.inf, 5], [True, False]))
-    check_states(half_open, np.array([[1e9, -0.5]]))
-    with pytest.raises(ValueError, match="state 1 of the belief"):
-        check_states(half_open, np.array([[1e9, -0.5], [0.0, 5.5]]))
-    check_states(CompiledModel(lottery_step, 3, 1), np.array([[np.nan]]))  # a model that does not say takes any numbers
 
 
 # ---- workers share a model and write to none of it

@@ -12,11 +12,11 @@ import numba
 import numpy as np
 import pytest
 
-from tab_marl.planning import textbook
+from tab_marl.planning import FilterOptions, ParticleFilter, textbook
 from tab_marl.planning.beliefs.belief import BeliefDepleted, update_particles
 from tab_marl.planning.model import CompiledModel, Particles
 from tab_marl.planning.random_kernels import uniform
-from tab_marl.planning.search.pomcp import Pomcp, PomcpOptions
+from tab_marl.planning.search.pomcp import START, Pomcp, PomcpOptions
 from tab_marl.planning.search.tree import ROOT
 from tab_marl.planning.tables import table_model
 
@@ -142,6 +142,33 @@ def test_preferred_actions_are_asked_at_the_root_and_at_new_nodes():
     assert preferred >= {textbook.NORTH, textbook.EAST}
 
 
+def test_before_the_first_action_a_prior_is_asked_all_the_same():
+    robot = 4  # in the middle of the lower row: three ways lead off, none of them back
+    model = textbook.tag("uniform", preferred=True)
+    plan = Pomcp(model, PomcpOptions(simulations=1)).plan([[robot, 20]], 0, latest=START)
+    assert (plan.visits >= 10).tolist() == [True, True, False, True, False]
+    rocks = textbook.rock_sample(4, 4)
+    belief = textbook.RockBelief(rocks.data).sample
+    plain, asked = (Pomcp(rocks, PomcpOptions(simulations=300)).plan(belief, 0, latest=h) for h in (None, START))
+    off_the_grid_or_bare = [textbook.WEST, 4]  # 4: sample
+    assert (plain.visits[off_the_grid_or_bare] > 0).all()
+    assert (asked.visits[off_the_grid_or_bare] == 0).all()
+    assert asked.values[asked.visits > 0].min() > 0
+
+
+def test_a_plain_prior_is_asked_before_the_first_action_too():
+    class Guided(PlainTiger):
+        def prior(self, state, action, observation, depth):
+            assert state in ("left", "right")
+            assert (action, observation) == START or action in range(3)
+            return np.zeros(3), np.array([0, -1, 0])
+
+    options = PomcpOptions(simulations=30, max_depth=3)
+    filtered = ParticleFilter(Guided(), ["left", "right"], FilterOptions(count=20))
+    for belief in (["left", "right"], filtered, filtered.sample):
+        assert Pomcp(Guided(), options).plan(belief, 0, latest=START).visits[1] == 0
+
+
 def test_common_random_numbers_make_a_particle_a_scenario():
     options = PomcpOptions(simulations=80, max_depth=1, exploration=50.0)
     shared = Pomcp(NOISY, dataclasses.replace(options, common_random_numbers=True)).plan([0.0], 0)
@@ -223,6 +250,12 @@ def test_a_second_process_finds_the_compiled_search_on_disk():
         ({"seconds": 0.0}, "seconds is 0.0, must be > 0"),
         ({"max_nodes": 0}, "max_nodes is 0"),
         ({"choose": "best"}, "choose is 'best'"),
+        ({"simulations": 1e3}, "simulations is 1000.0, must be a whole number: write 1000"),
+        ({"simulations": "10"}, "simulations is '10', must be a whole number"),
+        ({"simulations": None}, "simulations is None, must be a whole number"),
+        ({"max_depth": 5.0}, "max_depth is 5.0, must be a whole number: write 5"),
+        ({"exploration": "ten"}, "exploration is 'ten', must be a number"),
+        ({"seconds": "1"}, "seconds is '1', must be a number"),
     ],
 )
 def test_bad_options_are_named(change, words):
@@ -254,6 +287,65 @@ def test_bad_beliefs_and_roots_are_named(belief, root, words):
 def test_rewards_that_are_not_numbers_are_reported():
     with pytest.raises(ValueError, match="action 0 has value nan"):
         Pomcp(NOISY, PomcpOptions(simulations=10)).plan([math.nan], 0)
+
+
+def rounded_step(state, action, data, rng):
+    """Its observation is a float where it ought to be a number of its own."""
+    state[0] += uniform(rng)
+    return state[0], 0.0, False
+
+
+def test_a_float_observation_is_refused_interpreted_too():
+    for compiled in (True, False):
+        with pytest.raises(
+            TypeError, match=r"rounded_step return(s a float|ed np.float64).* cut to a whole number.*np.int64"
+        ):
+            Pomcp(CompiledModel(rounded_step, 2, 1), PomcpOptions(simulations=10, compiled=compiled)).plan([0.0], 0)
+
+
+class Still:
+    actions = 2
+    rollout = prior = action_names = None  # as a base class for others may have it
+
+    def __init__(self, result):
+        self.result = result
+
+    def step(self, state, action, rng):
+        return self.result
+
+
+@pytest.mark.filterwarnings("ignore:Still is a model in plain Python")
+def test_what_a_plain_step_may_not_return_is_named():
+    options = PomcpOptions(simulations=20, max_depth=3)
+    assert Pomcp(Still((0, "seen", 1.0, False)), options).plan([0], 0).values == pytest.approx([2.8525] * 2)
+    with pytest.raises(
+        TypeError, match=r"Still.step returned \(0, 1.0, False\), must return four things: \(next state"
+    ):
+        Pomcp(Still((0, 1.0, False)), options).plan([0], 0)
+    with pytest.raises(TypeError, match=r"Still.step returned None, must return four things"):
+        Pomcp(Still(None), options).plan([0], 0)
+    with pytest.raises(TypeError, match=r"observation array\(\[1, 2\]\), a ndarray, must be hashable .*tuple"):
+        Pomcp(Still((0, np.array([1, 2]), 1.0, False)), options).plan([0], 0)
+
+
+@pytest.mark.parametrize(
+    ("actions", "words"),
+    [
+        (["a", "b"], r"actions is \['a', 'b'\], must be the number of actions.*write actions = 2.*action_names"),
+        (2.0, "actions is 2.0, must be the number of actions, a whole one"),
+        ("ab", "actions is 'ab', must be the number of actions"),
+        (0, "actions is 0, must be >= 1"),
+    ],
+)
+def test_actions_that_are_no_number_are_named(actions, words):
+    model = Still(None)
+    model.actions = actions
+    with pytest.raises(ValueError, match=words):
+        Pomcp(model)
+    with pytest.raises(ValueError, match=words):
+        CompiledModel(rounded_step, actions, 1)
+    with pytest.raises(ValueError, match=r"state_size is 1.0, must be a whole number: write 1"):
+        CompiledModel(rounded_step, 2, 1.0)
 
 
 def test_a_model_without_step_is_refused():

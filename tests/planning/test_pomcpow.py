@@ -11,6 +11,7 @@ import pytest
 
 from tab_marl.planning import ContinuousModel, Particles, Pomcpow, PomcpowOptions, textbook
 from tab_marl.planning.model import PlainPythonWarning
+from tab_marl.planning.random_kernels import uniform
 from tab_marl.planning.search.tree import ROOT
 from tab_marl.planning.table_kernels import draw
 from tab_marl.planning.tables import table_model
@@ -156,6 +157,49 @@ def test_time_is_bounded():
     assert 1 <= plan.simulations < 10**7
 
 
+# ---- several cores
+
+
+def two_valued_step(state, action, data, rng, observation):
+    observation[0] = 1.0 if uniform(rng) < data[int(state[0])] else 0.0
+    return action * (state[0] - 0.5), False
+
+
+def two_valued_likelihood(before, action, after, observation, data):
+    chance = data[int(after[0])]
+    return chance if observation[0] > 0.5 else 1.0 - chance
+
+
+def counted(tree, node=ROOT, history=()):
+    """{history: visits}, by walking the tree."""
+    found = {history: int(tree.nodes["visits"][node])}
+    for edge in tree.edges_of(node):
+        seen = [tree.observation(child) for child in tree.children(edge)]
+        assert len(set(seen)) == len(seen)
+        for child, what in zip(tree.children(edge), seen, strict=True):
+            found |= counted(tree, child, (*history, int(tree.edge_actions[edge]), what))
+    return found
+
+
+def test_workers_trees_share_the_observations_that_both_met(same_tree):
+    model = ContinuousModel(two_valued_step, two_valued_likelihood, 2, 1, data=(0.3, 0.8))
+    options = PomcpowOptions(simulations=300, max_depth=4)
+    seeds = np.random.default_rng(5).integers(2**63, size=2).tolist()
+    alone = [
+        counted(Pomcpow(model, dataclasses.replace(options, simulations=150)).plan([0.0, 1.0], s).tree)
+        for s in map(np.random.default_rng, seeds)
+    ]
+    shared = dataclasses.replace(options, workers=2)
+    together = Pomcpow(model, shared).plan([0.0, 1.0], 5)
+    expected = {h: alone[0].get(h, 0) + alone[1].get(h, 0) for h in alone[0] | alone[1]}
+    assert counted(together.tree) == expected
+    action, seen = together.tree.best_line()[0]
+    after = {h[1]: n for h, n in expected.items() if len(h) == 2 and h[0] == action}
+    assert seen == max(after, key=after.get)
+    slow = Pomcpow(model, dataclasses.replace(shared, compiled=False)).plan([0.0, 1.0], 5)
+    assert same_tree(together.tree, slow.tree)
+
+
 # ---- plain Python, errors
 
 
@@ -180,6 +224,21 @@ def test_a_plain_python_model_is_searched_and_said_to_be_slow():
         plan = planner.plan([4, 5], 0)
     assert plan.action == 0
     assert all(isinstance(seen, float) for _, seen in plan.best_line()[:-1])
+
+
+def test_a_reading_in_an_array_is_named():
+    class Measured(PlainLightDark):
+        rollout = None
+
+        def step(self, state, action, rng):
+            after, seen, reward, terminal = super().step(state, action, rng)
+            return after, np.array([seen, seen]), reward, terminal
+
+    planner = Pomcpow(Measured(), PomcpowOptions(simulations=40, max_depth=5))
+    with pytest.raises(
+        TypeError, match=r"Measured.step returned the observation array\(.*tuple\(observation.tolist\(\)\)"
+    ):
+        planner.plan([4, 5], 0)
 
 
 def negative_likelihood(before, action, after, observation, data):
@@ -214,6 +273,8 @@ def test_a_model_without_likelihood_is_refused():
         ({"seconds": -1}, "seconds is -1"),
         ({"choose": "best"}, "choose is 'best'"),
         ({"discount": 1.0}, "give max_depth"),
+        ({"simulations": 1e3}, "simulations is 1000.0, must be a whole number: write 1000"),
+        ({"widening": "5"}, "widening is '5', must be a number"),
     ],
 )
 def test_bad_options_are_named(change, words):

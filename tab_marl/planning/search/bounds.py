@@ -21,7 +21,7 @@ def require_whole(name: str, value: object) -> None:
     """ValueError naming the field, its value and how to write it unless it is a whole number (Python's or numpy's)."""
     if isinstance(value, Integral):
         return
-    remedy = f": write {int(value)}" if isinstance(value, Real) and float(value).is_integer() else ""
+    remedy = f": write {float(value):.0f}" if isinstance(value, Real) and float(value).is_integer() else ""
     raise ValueError(f"{name} is {value!r}, must be a whole number{remedy}")
 
 

@@ -12,13 +12,15 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
+from threading import Lock
 from typing import TYPE_CHECKING, Any, Protocol
 from weakref import WeakSet
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.planning.model import CompiledModel, belief_states, draw_particles
+from tab_marl.planning.model import CompiledModel, belief_states, draw_particles, is_sampler
 from tab_marl.planning.search import kernels, merge_kernels
 from tab_marl.planning.search.plan import Search
 from tab_marl.planning.search.tree import SearchTree
@@ -48,6 +50,34 @@ def particle_blocks(
         yield draw_particles(min(BLOCK, simulations - done), states, weights, rng)
 
 
+class Source(Protocol):
+    """Where simulations start from."""
+
+    states: Any
+    weights: NDArray[np.float64] | None
+
+    def believe(self, count: int) -> None:
+        """Asks the belief for `count` states, in place of those that there are."""
+        ...
+
+
+def portion_of(belief: Any, simulations: int, seconds: float | None) -> int:
+    """How many states a sampler is asked for at a time: one for every simulation, but under a clock only a block of them.
+
+    The time may be up long before all could be drawn, or held in memory.
+    """
+    return min(simulations, BLOCK) if seconds is not None and is_sampler(belief) else simulations
+
+
+def starts(source: Source, simulations: int, portion: int, rng: np.random.Generator) -> Iterator[NDArray[np.int64]]:
+    """As `particle_blocks`, asking the belief anew after every `portion` of simulations; the first is there already."""
+    for begun in range(0, simulations, portion):
+        count = min(portion, simulations - begun)
+        if begun > 0:
+            source.believe(count)
+        yield from particle_blocks(count, len(source.states), source.weights, rng)
+
+
 @dataclass
 class Chunks:
     """How many simulations to run before the next look at the clock: about a tenth of the time that is left."""
@@ -66,6 +96,10 @@ class Chunks:
             self.deadline += seconds
         return seconds
 
+    def late(self) -> bool:
+        """Whether time is up."""
+        return self.deadline is not None and time.perf_counter() >= self.deadline
+
     def over(self, seconds: float, simulations: int) -> bool:
         """Whether time is up, after a chunk that took this long."""
         if self.deadline is None:
@@ -81,7 +115,7 @@ class Growth:
 
     model: CompiledModel
     options: PomcpOptions
-    belief: tuple[NDArray[np.float64], NDArray[np.float64] | None]
+    belief: Any
     rng: np.random.Generator
     start: SearchTree
     simulations: int
@@ -95,9 +129,9 @@ class Growth:
         start, actions = self.start, self.model.actions
         self.parents: NDArray[np.int32] | None = None
         self.table: NDArray[np.int32] | None = None
-        shared = len(self.belief[0]) if self.options.common_random_numbers else 0
-        words = self.rng.integers(2**64, size=2 + shared, dtype=np.uint64)
-        self.tree_stream, self.model_stream, self.seeds = words[:1], words[1:2], words[2:]
+        self.portion = portion_of(self.belief, self.simulations, self.options.seconds)
+        words = self._believe(self.portion, streams=2)
+        self.tree_stream, self.model_stream = words[:1], words[1:]
         # Every simulation adds at most one node and expands at most one.
         self.most = max(len(start), min(self.max_nodes, self.simulations + len(start)))
         self.spare = len(start.edges)
@@ -109,6 +143,17 @@ class Growth:
             np.empty(self.model.state_size), np.empty(horizon, dtype=np.int64), np.empty(horizon),
             np.empty(actions), np.empty(actions, dtype=np.int64),
         )  # fmt: skip
+
+    def believe(self, count: int) -> None:
+        self._believe(count, streams=0)
+
+    def _believe(self, count: int, streams: int) -> NDArray[np.uint64]:
+        """Draws states to start from, a seed for each where particles are scenarios, and first the streams' random words."""
+        self.states, self.weights = belief_states(self.model, self.belief, count, self.rng)
+        shared = len(self.states) if self.options.common_random_numbers else 0
+        words = self.rng.integers(2**64, size=streams + shared, dtype=np.uint64)
+        self.seeds = words[streams:]
+        return words[:streams]
 
     def _allocate(self, size: int) -> None:
         self.nodes = grown(self.nodes, size)
@@ -130,7 +175,7 @@ class Growth:
         options, (state, path_edges, path_rewards, values, counts) = self.options, self.scratch
         step, rollout, prior = self.model.functions
         run: int = kernels.search(
-            step, rollout, prior, self.model.data, self.belief[0], particles, self.seeds, self.model.actions,
+            step, rollout, prior, self.model.data, self.states, particles, self.seeds, self.model.actions,
             options.exploration, options.discount, options.horizon, options.deepest_node, len(self.nodes) < self.most,
             self.nodes, self.edges, self.edge_actions, self.parents, self.table, self.used, ROOT_LOG, INVERSE_ROOT,
             self.tree_stream, self.model_stream, state, path_edges, path_rewards, values, counts,
@@ -141,11 +186,14 @@ class Growth:
         """Compiles the search for this type of model, or loads it, before the clock runs."""
         self._search(np.empty(0, dtype=np.int64))
 
-    def run(self) -> None:
-        """All simulations, or as many as the time allows."""
+    def run(self, drawing: float) -> None:
+        """All simulations, or as many as the time allows, of which `drawing` states has taken some already."""
         seconds = self.options.seconds
-        chunks = Chunks(None if seconds is None else time.perf_counter() + seconds)
-        for block in particle_blocks(self.simulations, len(self.belief[0]), self.belief[1], self.rng):
+        chunks = Chunks(None if seconds is None else time.perf_counter() + seconds - drawing)
+        for block in starts(self, self.simulations, self.portion, self.rng):
+            if self.done > 0 and chunks.late():
+                self.timed_out = True
+                return
             if self.table is None and kernels.most_children(self.nodes, self.edges) > _MANY_CHILDREN:
                 began = time.perf_counter()
                 self._tabulate()
@@ -181,13 +229,29 @@ def grow_tree_compiled(
     model: CompiledModel, options: PomcpOptions, belief: Any, rng: np.random.Generator, start: SearchTree
 ) -> Search:
     """The search by `options.workers` threads."""
+    began = time.perf_counter()
+    belief = taking_turns(belief) if options.workers > 1 else belief
     growths = [
-        Growth(model, options, belief_states(model, belief, share, stream), stream, start, share, most)
+        Growth(model, options, belief, stream, start, share, most)
         for share, most, stream in shares(options.simulations, options.max_nodes, options.workers, rng)
     ]
+    drawing = time.perf_counter() - began
     growths[0].compiling = made_ready(model, growths[0])
-    run_all([growth.run for growth in growths])
+    run_all([partial(growth.run, drawing) for growth in growths])
     return merged([growth.finished() for growth in growths], start, options.max_nodes)
+
+
+def taking_turns(belief: Any) -> Any:
+    """The belief, a sampler asked by one thread at a time: it is the caller's, and need not bear more."""
+    if not is_sampler(belief):
+        return belief
+    lock = Lock()
+
+    def sampled(count: int, rng: np.random.Generator) -> Any:
+        with lock:
+            return belief(count, rng)
+
+    return sampled
 
 
 class Warmable(Protocol):

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.planning.model import CompiledModel, belief_objects, belief_states
-from tab_marl.planning.search.growing import merged, particle_blocks, shares
+from tab_marl.planning.model import CompiledModel, belief_objects, belief_states, numbered
+from tab_marl.planning.search.growing import merged, portion_of, shares, starts
 from tab_marl.planning.search.kernels import NO_CHILD, UNEXPANDED
 from tab_marl.planning.search.plan import Search
 from tab_marl.planning.search.tree import EDGE, NODE, ROOT, SearchTree
@@ -58,12 +58,20 @@ class _CompiledAsPython:
     """A compiled model's functions, interpreted, with the random numbers that the kernel would give them."""
 
     def __init__(self, model: CompiledModel, count: int, common: bool, belief: Any, rng: np.random.Generator) -> None:
-        self.model = model
-        self.states, self.weights = belief_states(model, belief, count, rng)
-        shared = len(self.states) if common else 0
-        words = rng.integers(2**64, size=2 + shared, dtype=np.uint64)
-        self.stream, self.word, self.seeds = Stream(int(words[0])), words[1:2], words[2:]
+        self.model, self.belief, self.common, self.random = model, belief, common, rng
+        words = self._believe(count, streams=2)
+        self.stream, self.word = Stream(int(words[0])), words[1:]
         self.has_rollout, self.has_prior = model.rollout is not None, model.prior is not None
+
+    def believe(self, count: int) -> None:
+        self._believe(count, streams=0)
+
+    def _believe(self, count: int, streams: int) -> NDArray[np.uint64]:
+        self.states, self.weights = belief_states(self.model, self.belief, count, self.random)
+        shared = len(self.states) if self.common else 0
+        words = self.random.integers(2**64, size=streams + shared, dtype=np.uint64)
+        self.seeds = words[streams:]
+        return words[:streams]
 
     def start(self, particle: int) -> NDArray[np.float64]:
         self.particle = particle
@@ -76,7 +84,7 @@ class _CompiledAsPython:
     def step(self, state: Any, action: int) -> tuple[Any, Hashable, float, bool]:
         function = getattr(self.model.step, "py_func", self.model.step)
         observation, reward, terminal = function(state, action, self.model.data, self.word)
-        return state, int(observation), float(reward), bool(terminal)
+        return state, numbered(observation, function), float(reward), bool(terminal)
 
     def rollout(self, state: Any, action: int, seen: Any, depth: int, max_depth: int, discount: float) -> float:
         assert self.model.rollout is not None
@@ -87,17 +95,46 @@ class _CompiledAsPython:
         return asked_prior(self.model, state, action, seen, depth)
 
 
+def gives(model: Any, name: str) -> bool:
+    """Whether a model in plain Python has the optional function; None says no, as in a `CompiledModel`."""
+    return getattr(model, name, None) is not None
+
+
+def checked_step(model: Any, state: Any, action: int, rng: np.random.Generator) -> tuple[Any, Hashable, float, bool]:
+    """One step of a model in plain Python. Raises TypeError naming what its `step` returned if that is no step."""
+    result = model.step(state, action, rng)
+    if not isinstance(result, tuple | list) or len(result) != 4:
+        raise TypeError(
+            f"{type(model).__name__}.step returned {result!r}, must return four things: (next state, observation, reward, terminal)"
+        )
+    after, seen, reward, terminal = result
+    try:
+        hash(seen)
+    except TypeError:
+        raise TypeError(
+            f"{type(model).__name__}.step returned the observation {seen!r}, a {type(seen).__name__}, must be hashable to be told "
+            "from others: return a number, a string or a tuple, such as tuple(observation.tolist()) for an array"
+        ) from None
+    return after, seen, reward, terminal
+
+
 class _PythonModel:
     """A model that is a Python class; states are whatever it likes."""
 
     def __init__(self, model: Any, count: int, common: bool, belief: Any, rng: np.random.Generator) -> None:
-        self.model = model
+        self.model, self.belief, self.common, self.random = model, belief, common, rng
         self.states, self.weights = belief_objects(belief, count, rng)
         self.stream = Stream(int(rng.integers(2**64, dtype=np.uint64)))
         self.rng = np.random.default_rng(int(rng.integers(2**63)))
-        shared = len(self.states) if common else 0
-        self.seeds = rng.integers(2**63, size=shared)
-        self.has_rollout, self.has_prior = hasattr(model, "rollout"), hasattr(model, "prior")
+        self._seed()
+        self.has_rollout, self.has_prior = gives(model, "rollout"), gives(model, "prior")
+
+    def believe(self, count: int) -> None:
+        self.states, self.weights = belief_objects(self.belief, count, self.random)
+        self._seed()
+
+    def _seed(self) -> None:
+        self.seeds = self.random.integers(2**63, size=len(self.states) if self.common else 0)
 
     def start(self, particle: int) -> Any:
         self.particle = particle
@@ -108,8 +145,7 @@ class _PythonModel:
             self.rng = np.random.default_rng((int(self.seeds[self.particle]), depth))
 
     def step(self, state: Any, action: int) -> tuple[Any, Hashable, float, bool]:
-        result: tuple[Any, Hashable, float, bool] = self.model.step(state, action, self.rng)
-        return result
+        return checked_step(self.model, state, action, self.rng)
 
     def rollout(self, state: Any, action: int, seen: Any, depth: int, max_depth: int, discount: float) -> float:
         return float(self.model.rollout(state, action, seen, depth, max_depth, discount, self.rng))
@@ -171,13 +207,13 @@ class _Growing:
             self.edge_visits[edge] += 1
             self.values[edge] += (leaf - self.values[edge]) / self.edge_visits[edge]
 
-    def finished(self, numbered: bool) -> SearchTree:
+    def finished(self, compiled: bool) -> SearchTree:
         nodes, edges = np.empty(len(self.seen), dtype=NODE), np.empty(len(self.actions), dtype=EDGE)
-        nodes["observation"] = self.seen if numbered else range(len(self.seen))
+        nodes["observation"] = self.seen if compiled else range(len(self.seen))
         nodes["sibling"], nodes["visits"] = self.sibling, self.node_visits
         nodes["first_edge"], nodes["edge_count"] = self.first_edge, self.edge_count
         edges["value"], edges["visits"], edges["child"] = self.values, self.edge_visits, self.child
-        return SearchTree(nodes, edges, np.array(self.actions, dtype=np.int32), None if numbered else tuple(self.seen))
+        return SearchTree(nodes, edges, np.array(self.actions, dtype=np.int32), None if compiled else tuple(self.seen))
 
 
 def grow_tree_in_python(
@@ -197,16 +233,17 @@ def _grown(
     rng: np.random.Generator,
     start: SearchTree,
 ) -> Search:
-    numbered = isinstance(model, CompiledModel)
-    source = (_CompiledAsPython if numbered else _PythonModel)(
-        model, simulations, options.common_random_numbers, belief, rng
+    compiled = isinstance(model, CompiledModel)
+    deadline = None if options.seconds is None else time.perf_counter() + options.seconds
+    portion = portion_of(belief, simulations, options.seconds)
+    source = (_CompiledAsPython if compiled else _PythonModel)(
+        model, portion, options.common_random_numbers, belief, rng
     )
     tree = _Growing(start)
     most = max(len(start), min(max_nodes, simulations + len(start)))
-    deadline = None if options.seconds is None else time.perf_counter() + options.seconds
     done = deepest = steps = 0
     timed_out = False
-    for block in particle_blocks(simulations, len(source.states), source.weights, rng):
+    for block in starts(source, simulations, portion, rng):
         with np.errstate(over="ignore"):  # a model's random words wrap round
             for particle in block.tolist():
                 depth, path_length = _simulate(tree, source, particle, options, most, model.actions)
@@ -216,7 +253,7 @@ def _grown(
                     break
         if timed_out:
             break
-    grown = tree.finished(numbered)
+    grown = tree.finished(compiled)
     return Search(grown, done, deepest, steps, "seconds" if timed_out else "simulations", len(grown) >= max_nodes)
 
 

@@ -15,14 +15,25 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tab_marl.planning.model import CompiledModel, belief_states, check_model, check_numbered, warn_of_plain_python
-from tab_marl.planning.search.bounds import Depths, check_horizon, require
+from tab_marl.planning.model import (
+    CompiledModel,
+    belief_objects,
+    belief_states,
+    check_model,
+    check_numbered,
+    warn_of_plain_python,
+)
+from tab_marl.planning.search.bounds import Depths, check_horizon, check_kinds, require
 from tab_marl.planning.search.growing import grow_tree_compiled
 from tab_marl.planning.search.interpreted import asked_prior, grow_tree_in_python
 from tab_marl.planning.search.plan import Plan, action_numbers, decided
 from tab_marl.planning.search.tree import ROOT, SearchTree
 
-__all__ = ["Plan", "Pomcp", "PomcpOptions"]
+__all__ = ["START", "Plan", "Pomcp", "PomcpOptions"]
+
+
+START = (-1, -1)
+"""As `latest`: nothing was done or seen yet. A model's prior is then asked with action -1 and observation -1."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +52,8 @@ class PomcpOptions(Depths):
     """Steps from the root down to which nodes are added; beyond, the rollout decides. None: `max_depth`."""
     seconds: float | None = None
     """Stop after this long even if simulations remain (the clock is read every 256 or fewer). The plan then depends on the
-    machine's speed; if the simulations are done first, it is the same as without."""
+    machine's speed; if the simulations are done first, it is the same as without, unless the belief is a sampler and they are
+    more than 2,048: under a clock it is asked for so many states at a time."""
     max_nodes: int = 1_000_000
     """Nodes at most; when reached, simulations go on without adding any, and the plan says that it is `full`. The whole tree
     takes up to ``max_nodes * (44 + 20 A)`` bytes; it is grown as needed. A tree to go on with (`start`) is kept even if larger."""
@@ -57,6 +69,7 @@ class PomcpOptions(Depths):
     """False: a `CompiledModel` runs interpreted, with the same random numbers and the same tree, for debugging its functions."""
 
     def __post_init__(self) -> None:
+        check_kinds(self)
         require(self.simulations >= 1, "simulations", self.simulations, ">= 1")
         require(
             math.isfinite(self.exploration) and self.exploration >= 0, "exploration", self.exploration, "finite, >= 0"
@@ -99,7 +112,8 @@ class Pomcp:
 
         `allowed` restricts the root: action numbers, or bool[A]. `prior_values` [A] with `prior_counts` [A] (or one count for
         all) start the root's actions as if tried that often with that mean return. Without them the model's own prior is asked
-        if `latest` gives the (action, observation) that led here (for a compiled model, with the belief's first state).
+        if `latest` gives the (action, observation) that led here (with the belief's first state): ``START`` where none did, in
+        the first plan of a game. Without `latest` the root has no prior, only the nodes below it.
         `start` is a tree to go on with instead, such as ``plan.tree.after(action, observation)`` of the plan before.
         The same seed, model and belief give the identical tree (unless `seconds` is set).
         """
@@ -139,8 +153,7 @@ def _asked_prior(
     if isinstance(model, CompiledModel):
         values, counts = asked_prior(model, belief_states(model, belief, 1, rng)[0][0].copy(), action, observation, 0)
     else:
-        states = belief(1, rng) if callable(belief) else getattr(belief, "states", belief)
-        values, counts = model.prior(states[0], action, observation, 0)
+        values, counts = model.prior(belief_objects(belief, 1, rng)[0][0], action, observation, 0)
     counts = np.asarray(counts, dtype=np.int64)
     return np.asarray(values, dtype=np.float64), np.maximum(counts, 0), np.flatnonzero(counts >= 0)
 

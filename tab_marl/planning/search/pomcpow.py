@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numba
@@ -20,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tab_marl.planning.model import CompiledModel, ContinuousModel, belief_states, check_model, warn_of_plain_python
 from tab_marl.planning.search import pomcpow_kernels as kernels
-from tab_marl.planning.search.bounds import Depths, check_horizon, require
+from tab_marl.planning.search.bounds import Depths, check_horizon, check_kinds, require
 from tab_marl.planning.search.growing import (
     INVERSE_ROOT,
     ROOT_LOG,
@@ -28,9 +29,11 @@ from tab_marl.planning.search.growing import (
     grown,
     made_ready,
     merged,
-    particle_blocks,
+    portion_of,
     run_all,
     shares,
+    starts,
+    taking_turns,
 )
 from tab_marl.planning.search.plan import Plan, Search, action_numbers, decided
 from tab_marl.planning.search.pomcpow_interpreted import search_in_python
@@ -73,6 +76,7 @@ class PomcpowOptions(Depths):
     """False: a `ContinuousModel` runs interpreted, with the same random numbers and the same tree."""
 
     def __post_init__(self) -> None:
+        check_kinds(self)
         require(self.simulations >= 1, "simulations", self.simulations, ">= 1")
         require(
             math.isfinite(self.exploration) and self.exploration >= 0, "exploration", self.exploration, "finite, >= 0"
@@ -139,10 +143,11 @@ class _Growth:
         share: tuple[int, int, np.random.Generator],
         start: SearchTree,
     ) -> None:
-        self.model, self.options = model, options
+        self.model, self.options, self.belief = model, options, belief
         self.simulations, self.node_cap, self.rng = share
         self.row_cap = max(kernels.FIRST_ROOM, options.max_particles // options.workers)
-        self.states, self.weights = belief_states(model, belief, self.simulations, self.rng)
+        self.portion = portion_of(belief, self.simulations, options.seconds)
+        self.believe(self.portion)
         words = self.rng.integers(2**64, size=2, dtype=np.uint64)
         self.streams = words[:1], words[1:]
         self.powers = powers_of(options)
@@ -161,6 +166,10 @@ class _Growth:
             np.empty(model.state_size), np.empty(model.state_size), np.empty(model.observation_size),
             np.empty(horizon, dtype=np.int64), np.empty(horizon),
         )  # fmt: skip
+
+    def believe(self, count: int) -> None:
+        """Draws states to start from."""
+        self.states, self.weights = belief_states(self.model, self.belief, count, self.rng)
 
     def _search(self, particles: NDArray[np.int64]) -> int:
         options = self.options
@@ -188,11 +197,14 @@ class _Growth:
             states, rewards, weights = (grown(a, min(self.row_cap, 2 * len(a))) for a in self.pool)
             self.pool = states, rewards, weights
 
-    def run(self) -> None:
-        """All simulations, or as many as the time allows."""
+    def run(self, drawing: float) -> None:
+        """All simulations, or as many as the time allows, of which `drawing` states has taken some already."""
         seconds = self.options.seconds
-        chunks = Chunks(None if seconds is None else time.perf_counter() + seconds)
-        for block in particle_blocks(self.simulations, len(self.states), self.weights, self.rng):
+        chunks = Chunks(None if seconds is None else time.perf_counter() + seconds - drawing)
+        for block in starts(self, self.simulations, self.portion, self.rng):
+            if self.done > 0 and chunks.late():
+                self.timed_out = True
+                return
             at = 0
             while at < len(block):
                 began = time.perf_counter()
@@ -207,11 +219,11 @@ class _Growth:
                     self.timed_out = self.done < self.simulations
                     return
 
-    def finished(self, first_number: int) -> Search:
-        """The search, its observations numbered from `first_number` on."""
-        count, edges = int(self.used[kernels.NODES]), int(self.used[kernels.EDGES])
+    def finished(self, numbers: NDArray[np.int64]) -> Search:
+        """The search, with `numbers` [nodes] for its observations."""
+        count, edges = len(numbers), int(self.used[kernels.EDGES])
         nodes = self.nodes[:count].copy()
-        nodes["observation"] = np.arange(first_number, first_number + count)
+        nodes["observation"] = numbers
         return Search(
             SearchTree(nodes, self.edges[:edges], self.edge_actions[:edges], None),
             self.done,
@@ -238,20 +250,42 @@ def raise_likelihood() -> None:
     )
 
 
+def _numbered(seen: NDArray[np.float64], roots: NDArray[np.int64]) -> NDArray[np.int64]:
+    """``[n]``: a number for each row of observations `seen` [n, O], the same for equal ones: the first such row's own.
+
+    By it the workers' trees find each other's nodes. One worker's tree needs none: its nodes keep the numbers of their rows, and
+    so do the `roots`, whose rows are no observations.
+    """
+    numbers = np.arange(len(seen))
+    if len(roots) == 1:
+        return numbers
+    rows = np.delete(numbers, roots)
+    order = rows[np.lexsort(seen[rows].T)]  # stable: of equal rows the first stays first
+    fresh = np.ones(len(order), dtype=np.bool_)
+    fresh[1:] = (seen[order[1:]] != seen[order[:-1]]).any(axis=1)
+    numbers[order] = order[fresh][np.cumsum(fresh) - 1]
+    return numbers
+
+
 def _search_compiled(
     model: ContinuousModel, options: PomcpowOptions, belief: Any, rng: np.random.Generator, start: SearchTree
 ) -> Search:
+    began = time.perf_counter()
+    belief = taking_turns(belief) if options.workers > 1 else belief
     growths = [
         _Growth(model, options, belief, share, start)
         for share in shares(options.simulations, options.max_nodes, options.workers, rng)
     ]
+    drawing = time.perf_counter() - began
     compiling = made_ready(model, growths[0])
-    run_all([growth.run for growth in growths])
-    firsts = np.cumsum([0, *(int(growth.used[kernels.NODES]) for growth in growths)]).tolist()
+    run_all([partial(growth.run, drawing) for growth in growths])
+    counts = [int(growth.used[kernels.NODES]) for growth in growths]
+    seen = np.concatenate([growth.seen[:count] for growth, count in zip(growths, counts, strict=True)])
+    ends = np.cumsum(counts, dtype=np.int64)
+    numbers = np.split(_numbered(seen, ends - counts), ends[:-1])
     search = merged(
-        [growth.finished(first) for growth, first in zip(growths, firsts, strict=False)], start, options.max_nodes
+        [growth.finished(own) for growth, own in zip(growths, numbers, strict=True)], start, options.max_nodes
     )
-    seen = np.concatenate([growth.seen[: growth.used[kernels.NODES]] for growth in growths])
     tree = SearchTree(search.tree.nodes, search.tree.edges, search.tree.edge_actions, Readings(seen))
     return Search(
         tree, search.simulations, search.depth, search.steps, search.stopped, search.full, compiling=compiling

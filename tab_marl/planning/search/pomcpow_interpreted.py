@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tab_marl.planning.model import ContinuousModel, belief_objects, belief_states
-from tab_marl.planning.search.growing import merged, particle_blocks, shares
-from tab_marl.planning.search.interpreted import Stream, mixed
+from tab_marl.planning.search.growing import merged, portion_of, shares, starts
+from tab_marl.planning.search.interpreted import Stream, checked_step, gives, mixed
 from tab_marl.planning.search.kernels import NO_CHILD, UNEXPANDED
 from tab_marl.planning.search.plan import Search, Stopped
 from tab_marl.planning.search.pomcpow_kernels import FIRST_ROOM
@@ -36,11 +36,14 @@ class _CompiledSource:
     """A compiled model's functions, interpreted, with the random numbers that the kernel would give them."""
 
     def __init__(self, model: ContinuousModel, count: int, belief: Any, rng: np.random.Generator) -> None:
-        self.model = model
-        self.states, self.weights = belief_states(model, belief, count, rng)
+        self.model, self.belief, self.random = model, belief, rng
+        self.believe(count)
         words = rng.integers(2**64, size=2, dtype=np.uint64)
         self.stream, self.word = _Uniform(int(words[0])), words[1:]
         self.has_rollout = model.rollout is not None
+
+    def believe(self, count: int) -> None:
+        self.states, self.weights = belief_states(self.model, self.belief, count, self.random)
 
     def step(self, state: Any, action: int) -> tuple[Any, Hashable, float, bool]:
         after, seen = state.copy(), np.empty(self.model.observation_size)
@@ -61,15 +64,17 @@ class _PythonSource:
     """A model that is a Python class."""
 
     def __init__(self, model: Any, count: int, belief: Any, rng: np.random.Generator) -> None:
-        self.model = model
-        self.states, self.weights = belief_objects(belief, count, rng)
+        self.model, self.belief, self.random = model, belief, rng
+        self.believe(count)
         self.stream = _Uniform(int(rng.integers(2**64, dtype=np.uint64)))
         self.rng = np.random.default_rng(int(rng.integers(2**63)))
-        self.has_rollout = hasattr(model, "rollout")
+        self.has_rollout = gives(model, "rollout")
+
+    def believe(self, count: int) -> None:
+        self.states, self.weights = belief_objects(self.belief, count, self.random)
 
     def step(self, state: Any, action: int) -> tuple[Any, Hashable, float, bool]:
-        result: tuple[Any, Hashable, float, bool] = self.model.step(copy.copy(state), action, self.rng)
-        return result
+        return checked_step(self.model, copy.copy(state), action, self.rng)
 
     def likelihood(self, before: Any, action: int, after: Any, seen: Any) -> float:
         return float(self.model.likelihood(before, action, after, seen))
@@ -221,18 +226,23 @@ def search_in_python(
     model: Any, options: PomcpowOptions, belief: Any, rng: np.random.Generator, start: SearchTree
 ) -> Search:
     """The search, interpreted; workers take turns."""
-    searches, seen = list[Search](), list[Any]()
+    searches, seen, first = list[Search](), list[Any](), dict[Any, int]()
     for simulations, node_cap, stream in shares(options.simulations, options.max_nodes, options.workers, rng):
         kind = _CompiledSource if isinstance(model, ContinuousModel) else _PythonSource
-        source = kind(model, simulations, belief, stream)
+        began, portion = time.perf_counter(), portion_of(belief, simulations, options.seconds)
+        source = kind(model, portion, belief, stream)
         row_cap = max(FIRST_ROOM, options.max_particles // options.workers)
         search = _Search(model, options, source, node_cap, row_cap)
         search.nodes.append(_Node(0, None))
         search.nodes[0].visits = 0
         search.plant(search.nodes[0], start.edge_actions.tolist())
-        done, timed_out = _run(search, simulations, stream)
+        done, timed_out = _run(search, simulations, portion, stream, began)
         tree = search.tree()
-        tree.nodes["observation"] += len(seen)
+        # Equal observations of several workers have the number of the first; a root's is no observation.
+        own = len(seen) + np.arange(len(tree))
+        if options.workers > 1:
+            own[1:] = [first.setdefault(node.seen, len(seen) + node.number) for node in search.nodes[1:]]
+        tree.nodes["observation"] = own
         seen += [node.seen for node in search.nodes]
         stopped: Stopped = "seconds" if timed_out else "simulations"
         searches.append(Search(tree, done, search.deepest, search.steps, stopped, len(tree) >= node_cap))
@@ -242,12 +252,12 @@ def search_in_python(
     return Search(tree, whole.simulations, whole.depth, whole.steps, whole.stopped, whole.full)
 
 
-def _run(search: _Search, simulations: int, rng: np.random.Generator) -> tuple[int, bool]:
-    """(simulations run, whether time was up before the last)."""
+def _run(search: _Search, simulations: int, portion: int, rng: np.random.Generator, began: float) -> tuple[int, bool]:
+    """(simulations run, whether time was up before the last); the clock runs since `began`, when the belief was asked."""
     seconds, done = search.options.seconds, 0
-    deadline = None if seconds is None else time.perf_counter() + seconds
+    deadline = None if seconds is None else began + seconds
     with np.errstate(over="ignore"):  # a model's random words wrap round
-        for block in particle_blocks(simulations, len(search.source.states), search.source.weights, rng):
+        for block in starts(search.source, simulations, portion, rng):
             for particle in block.tolist():
                 search.simulate(particle)
                 done += 1
