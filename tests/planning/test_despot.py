@@ -9,7 +9,7 @@ import numba
 import numpy as np
 import pytest
 
-from tab_marl.planning import Despot, DespotOptions, Particles, textbook
+from tab_marl.planning import CompiledModel, Despot, DespotOptions, Particles, textbook
 from tab_marl.planning.model import PlainPythonWarning
 from tab_marl.planning.search.tree import ROOT
 from tab_marl.planning.tables import table_model
@@ -192,10 +192,23 @@ def test_a_plain_python_model_is_searched_and_said_to_be_slow():
     assert seen == {"hear left", "hear right", "nothing"}
 
 
+def measuring_step(state, action, data, rng):
+    return 0.5, 1.0, False
+
+
+def test_a_measured_observation_is_refused_where_it_would_be_cut():
+    model = CompiledModel(measuring_step, 2, 1)
+    options = DespotOptions(scenarios=5, reward_bounds=(0, 1), compiled=False)
+    with pytest.raises(TypeError, match=r"measuring_step returned 0\.5 as its observation, which would be cut"):
+        Despot(model, options).plan([0.0], 0)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         ({"scenarios": 0}, "scenarios is 0, must be >= 1"),
+        ({"scenarios": 50.0}, "scenarios is 50.0, must be a whole number: write 50"),
+        ({"regularisation": "none"}, "regularisation is 'none', must be a number"),
         ({"trials": 0}, "trials is 0"),
         ({"regularisation": -1.0}, "regularisation is -1.0"),
         ({"share": 1.0}, r"share is 1.0, must be in \[0, 1\)"),

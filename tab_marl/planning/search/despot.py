@@ -29,7 +29,7 @@ from tab_marl.planning.model import (
     warn_of_plain_python,
 )
 from tab_marl.planning.search import despot_kernels as kernels
-from tab_marl.planning.search.bounds import Depths, check_horizon, require
+from tab_marl.planning.search.bounds import Depths, check_horizon, check_kinds, require
 from tab_marl.planning.search.despot_interpreted import search_in_python
 from tab_marl.planning.search.despot_rewards import check_met, check_promises, trivial_rewards
 from tab_marl.planning.search.growing import Chunks, grown, table_size
@@ -96,6 +96,7 @@ class DespotOptions(Depths):
     """False: a `CompiledModel` runs interpreted, with the same random numbers and the same tree, for debugging its functions."""
 
     def __post_init__(self) -> None:
+        check_kinds(self)
         require(self.scenarios >= 1, "scenarios", self.scenarios, ">= 1")
         require(self.trials >= 1, "trials", self.trials, ">= 1")
         require(self.seconds is None or self.seconds > 0, "seconds", self.seconds, "> 0")

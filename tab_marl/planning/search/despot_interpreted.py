@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tab_marl.planning.model import CompiledModel, belief_objects, belief_states
+from tab_marl.planning.model import CompiledModel, belief_objects, belief_states, numbered
 from tab_marl.planning.search import despot_kernels as kernels
 from tab_marl.planning.search.despot_rewards import check_met, trivial_rewards
 from tab_marl.planning.search.interpreted import Stream, mixed
@@ -39,8 +39,9 @@ class _CompiledSource:
 
     def step(self, state: Any, action: int) -> tuple[Any, Hashable, float, bool]:
         after = state.copy()
-        observation, reward, terminal = _plain(self.model.step)(after, action, self.model.data, self.word)
-        return after, int(observation), float(reward), bool(terminal)
+        function = _plain(self.model.step)
+        observation, reward, terminal = function(after, action, self.model.data, self.word)
+        return after, numbered(observation, function), float(reward), bool(terminal)
 
     def rollout(self, state: Any, action: int, seen: Any, depth: int, max_depth: int, discount: float) -> float:
         function = _plain(self.model.rollout)
@@ -266,8 +267,8 @@ def search_in_python(
     """The search, interpreted."""
     from tab_marl.planning.search.despot import DESPOT_EDGE, DESPOT_NODE, drawn_scenarios, finished, powers_of
 
-    numbered = isinstance(model, CompiledModel)
-    source = (_CompiledSource if numbered else _PythonSource)(model, options, belief, rng)
+    whole = isinstance(model, CompiledModel)
+    source = (_CompiledSource if whole else _PythonSource)(model, options, belief, rng)
     start, seeds = drawn_scenarios(options.scenarios, len(source.states), source.weights, rng)
     search = _Search(model, options, source, root_actions.tolist(), seeds.tolist())
     root = search.add(0, 0)
@@ -279,7 +280,7 @@ def search_in_python(
     nodes, edges = np.zeros(len(search.nodes), dtype=DESPOT_NODE), np.zeros(len(search.edges), dtype=DESPOT_EDGE)
     nodes["sibling"] = edges["child"] = NO_CHILD
     for i, node in enumerate(search.nodes):
-        seen = node.seen if numbered else i
+        seen = node.seen if whole else i
         count = 0 if node.edges is None else len(node.edges)
         nodes[["observation", "lower", "upper", "scenarios", "depth", "first_edge", "edge_count"]][i] = (
             seen, node.lower, node.upper, len(node.held), node.depth, node.first_edge, count,
@@ -292,6 +293,6 @@ def search_in_python(
             nodes["sibling"][numbers[:-1]] = numbers[1:]
     used = np.zeros(9, dtype=np.int64)
     used[kernels.TRIALS], used[kernels.DEEPEST], used[kernels.STEPS] = search.trials, search.deepest, search.steps
-    observations = None if numbered else tuple(node.seen for node in search.nodes)
+    observations = None if whole else tuple(node.seen for node in search.nodes)
     edge_actions = np.array([edge.action for edge in search.edges], dtype=np.int32)
     return finished(nodes, edges, edge_actions, options, powers_of(options), used, stopped, observations)
