@@ -156,6 +156,7 @@ def test_before_the_first_action_a_prior_is_asked_all_the_same():
     assert asked.values[asked.visits > 0].min() > 0
 
 
+@pytest.mark.filterwarnings("ignore:Guided is a model in plain Python")
 def test_a_plain_prior_is_asked_before_the_first_action_too():
     class Guided(PlainTiger):
         def prior(self, state, action, observation, depth):

@@ -226,6 +226,7 @@ def test_a_plain_python_model_is_searched_and_said_to_be_slow():
     assert all(isinstance(seen, float) for _, seen in plan.best_line()[:-1])
 
 
+@pytest.mark.filterwarnings("ignore:Measured is a model in plain Python")
 def test_a_reading_in_an_array_is_named():
     class Measured(PlainLightDark):
         rollout = None
