@@ -139,7 +139,7 @@ def curve_plot(
 ) -> str:
     """Shares over x, one line per planner with its marks, `named` at its end; bands as pale areas."""
     width, height, left, top, foot = 400, 232, 32, 10, 34
-    right = LABELS + 6 if named else 12
+    right = LABELS + 16 if named else 12
     w, h = width - left - right, height - top - foot
     start, end = x_range
 

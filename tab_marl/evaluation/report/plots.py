@@ -93,7 +93,7 @@ def _measures(results: Results, family: str) -> Figure:
         colour, mark, _ = LOOK.get(planner, UNKNOWN)
         for axis, pick, scale in ((axes[0, 0], "atcr", 100.0), (axes[0, 1], "steps", 0.01)):
             part = [(missions.index(x.mission), getattr(x, pick)) for x in lines if x.planner == planner]
-            at = np.array([m for m, _ in part]) + 0.11 * (i - (len(planners) - 1) / 2)
+            at = np.array([m for m, _ in part]) + 0.72 / len(planners) * (i - (len(planners) - 1) / 2)
             value = scale * np.array([v.value for _, v in part])
             spread = scale * np.array([[v.value - v.low for _, v in part], [v.high - v.value for _, v in part]])
             hollow = {"markerfacecolor": "white"} if planner not in COMPETING_PLANNERS else {}
