@@ -238,16 +238,21 @@ def check_numbered(model: Any) -> None:
         )
 
 
-def numbered(observation: Any, step: Callable[..., Any]) -> int:
-    """The observation of a compiled model's `step` that runs interpreted: a whole number, as its compiled form insists on.
+def numbered(observation: Any, step: Callable[..., Any] | None = None) -> int:
+    """An observation of a model that numbers them, from its `step` that runs interpreted, or handed to a filter: a whole
+    number by type, as compiled functions insist on.
 
     Raises TypeError for anything else: a reading cut to a whole number would be another observation.
     """
     if isinstance(observation, int | np.integer | np.bool_):
         return int(observation)
+    wrong = f"observation is {observation!r}, must be a whole number"
+    if step is not None:
+        name = getattr(step, "__name__", "step")
+        wrong = f"{name} returned {observation!r} as its observation, which would be cut to a whole number"
     raise TypeError(
-        f"{getattr(step, '__name__', 'step')} returned {observation!r} as its observation, which would be cut to a whole number: "
-        "return np.int64(...) of a number that stands for what is seen; for observations that are measured, see ContinuousModel"
+        f"{wrong}: give np.int64(...) of a number that stands for what is seen; for observations that are measured, see "
+        "ContinuousModel"
     )
 
 

@@ -18,8 +18,7 @@ from tab_marl.planning.beliefs.filter_report import (
     Remedy,
     named,
 )
-from tab_marl.planning.beliefs.observations import observation_number
-from tab_marl.planning.model import CompiledModel, Particles, action_names
+from tab_marl.planning.model import CompiledModel, Particles, action_names, numbered
 from tab_marl.planning.tables import SparseData, SparseRows, TableData
 
 _LISTED = 5
@@ -80,7 +79,7 @@ class ExactFilter:
         """Takes the step in which `action` was done, `observation` seen, and the process did not end. Returns itself."""
         if not 0 <= action < self.model.actions:
             raise ValueError(f"action is {action}, must be in 0..{self.model.actions - 1}")
-        observation, seen = observation_number(observation), self._observation[action].shape[1]
+        observation, seen = numbered(observation), self._observation[action].shape[1]
         if not 0 <= observation < seen:
             raise ValueError(f"observation is {observation}, must be in 0..{seen - 1}")
         believed = self._after(self.probabilities, action, observation, doubt=0.0)
@@ -88,9 +87,8 @@ class ExactFilter:
             raise ImpossibleObservation(self._event(action, observation, None, self._log.updates + 1))
         doubting = None if self.strict else self._after(self._doubting, action, observation, self.doubt)
         if self._contradicted and believed is not None and doubting is not None and doubting[believed == 0].sum() > 0.5:
-            believed = (
-                None  # explained, but only by states that nothing but the doubt about earlier steps kept possible
-            )
+            # Explained, but only by states that nothing but the doubt about earlier steps kept possible.
+            believed = None
         self._log.updates += 1
         self._log.least_effective = float(len(self.probabilities))
         if believed is None:

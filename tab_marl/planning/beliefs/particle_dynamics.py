@@ -12,7 +12,6 @@ from numba import typeof, types
 from numpy.typing import NDArray
 
 from tab_marl.planning.beliefs import filter_kernels
-from tab_marl.planning.beliefs.observations import observation_number
 from tab_marl.planning.callbacks import callback
 from tab_marl.planning.model import (
     CompiledModel,
@@ -21,6 +20,7 @@ from tab_marl.planning.model import (
     belief_states,
     check_states,
     draw_particles,
+    numbered,
 )
 from tab_marl.planning.tables import SparseData, TableData
 
@@ -103,7 +103,7 @@ class CompiledDynamics:
     def advance(
         self, states: NDArray[np.float64], action: int, observation: Any, rng: np.random.Generator
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        observation = observation_number(observation)
+        observation = numbered(observation)
         word = rng.integers(2**64, size=1, dtype=np.uint64)
         after, weights = np.empty_like(states), np.empty(len(states))
         broken = filter_kernels.advance(

@@ -130,8 +130,10 @@ class Growth:
         self.parents: NDArray[np.int32] | None = None
         self.table: NDArray[np.int32] | None = None
         self.portion = portion_of(self.belief, self.simulations, self.options.seconds)
-        words = self._believe(self.portion, streams=2)
+        self._ask(self.portion)
+        words = self.rng.integers(2**64, size=2, dtype=np.uint64)
         self.tree_stream, self.model_stream = words[:1], words[1:]
+        self._seed()
         # Every simulation adds at most one node and expands at most one.
         self.most = max(len(start), min(self.max_nodes, self.simulations + len(start)))
         self.spare = len(start.edges)
@@ -145,15 +147,16 @@ class Growth:
         )  # fmt: skip
 
     def believe(self, count: int) -> None:
-        self._believe(count, streams=0)
+        self._ask(count)
+        self._seed()
 
-    def _believe(self, count: int, streams: int) -> NDArray[np.uint64]:
-        """Draws states to start from, a seed for each where particles are scenarios, and first the streams' random words."""
+    def _ask(self, count: int) -> None:
         self.states, self.weights = belief_states(self.model, self.belief, count, self.rng)
+
+    def _seed(self) -> None:
+        """One seed for every state, where particles are scenarios."""
         shared = len(self.states) if self.options.common_random_numbers else 0
-        words = self.rng.integers(2**64, size=streams + shared, dtype=np.uint64)
-        self.seeds = words[streams:]
-        return words[:streams]
+        self.seeds = self.rng.integers(2**64, size=shared, dtype=np.uint64)
 
     def _allocate(self, size: int) -> None:
         self.nodes = grown(self.nodes, size)
@@ -230,7 +233,7 @@ def grow_tree_compiled(
 ) -> Search:
     """The search by `options.workers` threads."""
     began = time.perf_counter()
-    belief = taking_turns(belief) if options.workers > 1 else belief
+    belief = taking_turns(belief)
     growths = [
         Growth(model, options, belief, stream, start, share, most)
         for share, most, stream in shares(options.simulations, options.max_nodes, options.workers, rng)
@@ -245,11 +248,11 @@ def taking_turns(belief: Any) -> Any:
     """The belief, a sampler asked by one thread at a time: it is the caller's, and need not bear more."""
     if not is_sampler(belief):
         return belief
-    lock = Lock()
+    sampler, lock = getattr(belief, "particles", belief), Lock()
 
     def sampled(count: int, rng: np.random.Generator) -> Any:
         with lock:
-            return belief(count, rng)
+            return sampler(count, rng)
 
     return sampled
 

@@ -59,19 +59,22 @@ class _CompiledAsPython:
 
     def __init__(self, model: CompiledModel, count: int, common: bool, belief: Any, rng: np.random.Generator) -> None:
         self.model, self.belief, self.common, self.random = model, belief, common, rng
-        words = self._believe(count, streams=2)
+        self._ask(count)
+        words = rng.integers(2**64, size=2, dtype=np.uint64)
         self.stream, self.word = Stream(int(words[0])), words[1:]
+        self._seed()
         self.has_rollout, self.has_prior = model.rollout is not None, model.prior is not None
 
     def believe(self, count: int) -> None:
-        self._believe(count, streams=0)
+        self._ask(count)
+        self._seed()
 
-    def _believe(self, count: int, streams: int) -> NDArray[np.uint64]:
+    def _ask(self, count: int) -> None:
         self.states, self.weights = belief_states(self.model, self.belief, count, self.random)
+
+    def _seed(self) -> None:
         shared = len(self.states) if self.common else 0
-        words = self.random.integers(2**64, size=streams + shared, dtype=np.uint64)
-        self.seeds = words[streams:]
-        return words[:streams]
+        self.seeds = self.random.integers(2**64, size=shared, dtype=np.uint64)
 
     def start(self, particle: int) -> NDArray[np.float64]:
         self.particle = particle

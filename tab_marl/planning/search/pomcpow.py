@@ -272,7 +272,7 @@ def _search_compiled(
     model: ContinuousModel, options: PomcpowOptions, belief: Any, rng: np.random.Generator, start: SearchTree
 ) -> Search:
     began = time.perf_counter()
-    belief = taking_turns(belief) if options.workers > 1 else belief
+    belief = taking_turns(belief)
     growths = [
         _Growth(model, options, belief, share, start)
         for share in shares(options.simulations, options.max_nodes, options.workers, rng)
