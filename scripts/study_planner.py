@@ -38,8 +38,9 @@ class Variant:
 
     planner: str
     options: PlannerOptions = field(default_factory=PlannerOptions)
-    knows: Literal["those played", "the others"] = "those played"
-    """Whose paths population-POMCP draws, and are precedents: of the split that is played, or of the other one."""
+    knows: Literal["those played", "the others", "the others unlike it"] = "those played"
+    """Whose paths population-POMCP draws, and are precedents: of the split that is played, of the other one, or of those in
+    the other one that have no style (of a mixture: no habit) in common with the adversary of the episode."""
 
 
 def pursuing(planner: str, milliseconds: float = 20, **changes: Any) -> Variant:
@@ -65,6 +66,7 @@ VARIANTS: dict[str, Variant] = {
     "population of others 50 ms": replace(pursuing("population-POMCP", 50), knows="the others"),
     "precedents of others": replace(pursuing(PRECEDENTS), knows="the others"),
     "precedents of others 50 ms": replace(pursuing(PRECEDENTS, 50), knows="the others"),
+    "precedents unlike it 50 ms": replace(pursuing(PRECEDENTS, 50), knows="the others unlike it"),
     "oracle": pursuing("oracle"),
     "S-POMCP": pursuing("S-POMCP"),
     "FP-POMCP": pursuing("FP-POMCP"),
@@ -92,16 +94,27 @@ VARIANTS: dict[str, Variant] = {
 }
 
 
+def styles(name: str) -> set[str]:
+    """What a policy may drive in."""
+    style = opponent(name).style
+    return {habit.style.name for habit in style.mixture} or {style.name}
+
+
 def play(
     name: str, variant: Variant, task: Task, unit: Unit, split: Split, base_seed: int, warm: bool = False
 ) -> dict[str, object]:
     """One episode, as a row."""
     _, episode_seed, planner_seed = unit_seeds(base_seed, unit)
     names = zoo_names(split)
+    adversary = names[unit.seed % len(names)]
     other: Split = "final" if split == "development" else "development"
-    known = population(names if variant.knows == "those played" else zoo_names(other))
-    agent = PlannerAgent(variant.planner, replace(variant.options, rollouts=known, precedents=known))
-    policy = opponent(names[unit.seed % len(names)])
+    known = names if variant.knows == "those played" else zoo_names(other)
+    if variant.knows == "the others unlike it":
+        known = tuple(name for name in known if not styles(name) & styles(adversary))
+    agent = PlannerAgent(
+        variant.planner, replace(variant.options, rollouts=population(known), precedents=population(known))
+    )
+    policy = opponent(adversary)
     row = run_episode(
         task, agent, policy, episode_seed, False, unit.seed, planner_seed, max_steps=11 if warm else None
     ).row
