@@ -8,9 +8,10 @@ name                  adversary model
 S-POMCP               uniform random moves within the speed limit
 FP-POMCP              the shortest path to the mission's objectives at full speed
 MLE-POMCP             moves counted from sightings of the development policies and of this episode, kept feasible
-TAB-POMCP             the TAB-Field's bridge kernel
-TAB-POMCP+precedents  the same, or as other policies (those for development) drove on this task: whichever foresees better
-oracle                the TAB-Field's, and the adversary is always seen (environment option `full_observation`)
+TAB-POMCP             the TAB-Field under two references, whichever foresees better: run-and-tumble (its bridge kernel), and
+                      drivers with habits drawn at random (`tab_marl.planning.models.drawn_ways`)
+TAB-POMCP+precedents  the TAB-Field's bridge kernel, or as other policies (those for development) drove on this task
+oracle                the TAB-Field's bridge kernel, and the adversary is always seen (environment option `full_observation`)
 population-POMCP      trajectories of the very policies that may be played, weighted by what was seen: a ceiling
 random                none: drives to random waypoints
 ====================  ==================================================================================================
@@ -33,6 +34,7 @@ from tab_marl.envs.ego_observation import EgoView, parse_ego_observation
 from tab_marl.field.problem import FieldOptions
 from tab_marl.mission.propositions import region_of
 from tab_marl.mission.tasks import Task
+from tab_marl.planning.models.drawn_ways import WaysOptions, draw_ways
 from tab_marl.planning.models.field_model import FieldModel
 from tab_marl.planning.models.guarded import EvidentModel, Guarded
 from tab_marl.planning.models.interface import AdversaryModel, Sighting, TickObservation
@@ -66,6 +68,8 @@ class PlannerOptions:
     routes: RouteOptions = field(default_factory=RouteOptions)
     tab_field: FieldOptions = field(default_factory=FieldOptions)
     """Of TAB-POMCP, with and without precedents, and of the oracle."""
+    ways: WaysOptions | None = field(default_factory=WaysOptions)
+    """Of TAB-POMCP: drivers with habits of their own, an even match for the field. None: the field alone, as in the paper."""
     shortest_path: ShortestPathOptions = field(default_factory=ShortestPathOptions)
     pool: PoolOptions = field(default_factory=PoolOptions)
     guards: tuple[tuple[str, float], ...] = GUARDS
@@ -223,9 +227,12 @@ class PlannerAgent:
         solved = None if memory is None else memory.field(scenario, mission, options.tab_field)
         model = FieldModel(scenario, mission, options.tab_field, solved)
         if self.name == PRECEDENTS:
-            pool = self._pool(options.precedents or zoo_rollouts("development"), task, rng)
-            return Mixture([model, pool], [0.5, 0.5])
-        return model
+            others = options.precedents or zoo_rollouts("development")
+        elif self.name == "TAB-POMCP" and options.ways is not None:
+            others = _drawn(options.ways)
+        else:
+            return model
+        return Mixture([model, self._pool(others, task, rng)], [0.5, 0.5])
 
     def _pool(self, rollouts: Rollouts, task: Task, rng: np.random.Generator) -> TrajectoryPool:
         positions, completed = rollouts(task, rng)
@@ -312,6 +319,11 @@ def goal_places(task: Task) -> tuple[tuple[float, float], ...]:
     regions = (region_of(place, task.scenario) for goal in task.mission.goals for place in goal.places)
     own = () if task.scenario.ego_goal is None else (task.scenario.ego_goal.centre,)
     return tuple(dict.fromkeys([*(region.centre for region in regions), *own]))
+
+
+def _drawn(options: WaysOptions) -> Rollouts:
+    """Of drivers with habits drawn at random."""
+    return lambda task, rng: draw_ways(task.scenario, task.mission, rng, options)
 
 
 def zoo_rollouts(split: Split | None = None) -> Rollouts:

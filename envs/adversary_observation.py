@@ -37,11 +37,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tab_marl.envs import adversary_kernels as kernels
-from tab_marl.envs.adversary_tables import LATENT_MAX, Parts, Tables, later_windows, pack, zones
+from tab_marl.envs.adversary_tables import LATENT_MAX, Parts, Tables, later_windows, pack
 from tab_marl.envs.reward import Gained
-from tab_marl.envs.styles import SLACK_NEEDED, STRENGTHS, Latents, Style, clearance_cost, fences_crossed, styled_cost
+from tab_marl.envs.styles import SLACK_NEEDED, STRENGTHS, Latents, Style, clearance_cost, styled_cost
 from tab_marl.mission.automaton import COMPLETED, FAILED, UNBOUNDED, MissionAutomaton
 from tab_marl.mission.compile import compile_mission
+from tab_marl.mission.fences import failing_regions, fences_crossed
 from tab_marl.mission.model import Mission
 from tab_marl.mission.route import RouteField, solve_route
 from tab_marl.world.grid import GridMap
@@ -142,7 +143,7 @@ class _Plain:
 
     @classmethod
     def of(cls, scenario: Scenario, automaton: MissionAutomaton, grid: GridMap) -> _Plain:
-        failing = tuple(r for r, fails in zip(automaton.regions, zones(automaton).T, strict=True) if fails.any())
+        failing = failing_regions(automaton)
         zone_distance = np.full(grid.cells, np.inf)
         for region in failing:
             zone_distance = np.minimum(zone_distance, region.distance(grid.centres))

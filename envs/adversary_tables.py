@@ -13,6 +13,7 @@ from tab_marl.envs import adversary_kernels as k
 from tab_marl.envs.lidar import Lidar
 from tab_marl.envs.styles import Latents
 from tab_marl.mission.automaton import COMPLETED, FAILED, MissionAutomaton
+from tab_marl.mission.fences import zones
 from tab_marl.mission.route import RouteField
 from tab_marl.world.regions import Disc, Region
 from tab_marl.world.scenario import Scenario
@@ -79,12 +80,6 @@ class Parts:
     strength: float
     windows: NDArray[np.int32]
     """``[U, 2]`` `later_windows`."""
-
-
-def zones(automaton: MissionAutomaton) -> NDArray[np.bool_]:
-    """``[U, P]``: whether being in region p alone fails the mission at location u."""
-    alone = 1 << np.arange(len(automaton.regions))
-    return np.asarray((automaton.next_location[:, alone] == FAILED) | (automaton.forbidden_until[:, alone] > 0))
 
 
 def later_windows(automaton: MissionAutomaton, horizon_ticks: int) -> NDArray[np.int32]:

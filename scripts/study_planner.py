@@ -22,6 +22,7 @@ from tab_marl.evaluation.episode import run_episode
 from tab_marl.evaluation.units import Unit, unit_seeds
 from tab_marl.field.problem import FieldOptions
 from tab_marl.mission.tasks import Task, sample_task
+from tab_marl.planning.models.drawn_ways import WaysOptions
 from tab_marl.planning.pursuit.decide import PursuitOptions
 from tab_marl.planning.pursuit.itineraries import EFFORT
 from tab_marl.planning.pursuit.scenarios import ReuseOptions
@@ -44,13 +45,20 @@ class Variant:
 
 
 def pursuing(planner: str, milliseconds: float = 20, **changes: Any) -> Variant:
-    return Variant(planner, PlannerOptions(pursuit=PursuitOptions.for_milliseconds(milliseconds, **changes)))
+    """TAB-POMCP's field alone, without drawn ways."""
+    return Variant(planner, PlannerOptions(pursuit=PursuitOptions.for_milliseconds(milliseconds, **changes), ways=None))
 
 
 def predicting(milliseconds: float = 20, **changes: Any) -> Variant:
-    """TAB-POMCP with another field."""
+    """TAB-POMCP with another field, alone."""
     pursuit = PursuitOptions.for_milliseconds(milliseconds)
-    return Variant("TAB-POMCP", PlannerOptions(pursuit=pursuit, tab_field=FieldOptions(**changes)))
+    return Variant("TAB-POMCP", PlannerOptions(pursuit=pursuit, tab_field=FieldOptions(**changes), ways=None))
+
+
+def drawing(milliseconds: float = 20, **changes: Any) -> Variant:
+    """TAB-POMCP as it comes, its field and ways of drivers with habits drawn at random."""
+    pursuit, ways = PursuitOptions.for_milliseconds(milliseconds), WaysOptions(**changes)
+    return Variant("TAB-POMCP", PlannerOptions(pursuit=pursuit, ways=ways))
 
 
 OPEN_LOOP = {"method": "routes", "detours": 0, "paths": 200, "screened": 1000, "keep_bonus": 0.0}
@@ -60,6 +68,11 @@ VARIANTS: dict[str, Variant] = {
     "er, rewards as they are": pursuing("TAB-POMCP", **OPEN_LOOP, completion_weight=1.0),
     "routes": pursuing("TAB-POMCP", method="routes"),
     **{f"tree {effort.milliseconds:g} ms": pursuing("TAB-POMCP", effort.milliseconds) for effort in EFFORT},
+    "TAB-POMCP": drawing(),
+    "TAB-POMCP 50 ms": drawing(50),
+    "TAB-POMCP, no late ways": drawing(late_share=0.0),
+    "TAB-POMCP, shortest sides": drawing(fence_widths=0.0),
+    "TAB-POMCP, even ground": drawing(cost_deviation=0.0),
     "population": pursuing("population-POMCP"),
     "population 50 ms": pursuing("population-POMCP", 50),
     "population of others": replace(pursuing("population-POMCP"), knows="the others"),
@@ -70,7 +83,7 @@ VARIANTS: dict[str, Variant] = {
     "oracle": pursuing("oracle"),
     "S-POMCP": pursuing("S-POMCP"),
     "FP-POMCP": pursuing("FP-POMCP"),
-    "tree, nothing kept": Variant("TAB-POMCP", PlannerOptions(reuse=ReuseOptions(renewed_share=1.0))),
+    "tree, nothing kept": Variant("TAB-POMCP", PlannerOptions(reuse=ReuseOptions(renewed_share=1.0), ways=None)),
     "tree, c = 1": pursuing("TAB-POMCP", exploration=1.0),
     "tree, c = 25": pursuing("TAB-POMCP", exploration=25.0),
     "tree, c = 100": pursuing("TAB-POMCP", exploration=100.0),
@@ -88,7 +101,7 @@ VARIANTS: dict[str, Variant] = {
     "tree, drive and turn": predicting(reference="drive_and_turn"),
     "tree, runs of 0.5 m": predicting(mean_run_metres=0.5),
     "tree, runs of 2 m": predicting(mean_run_metres=2.0),
-    "tree, guarded": Variant("TAB-POMCP", PlannerOptions(guards=(*GUARDS, ("TAB-POMCP", 0.2)))),
+    "tree, guarded": Variant("TAB-POMCP", PlannerOptions(guards=(*GUARDS, ("TAB-POMCP", 0.2)), ways=None)),
     "tree, rewards as they are": pursuing("TAB-POMCP", completion_weight=1.0),
     "tree, completion at 10 times": pursuing("TAB-POMCP", completion_weight=10.0),
 }

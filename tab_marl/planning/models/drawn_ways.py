@@ -1,0 +1,181 @@
+"""Ways under costs that are drawn at random: how drivers with habits, whatever they are, would carry out a mission.
+
+A field's reference process tumbles: it knows no driver who keeps to a way because of a preference that lasts. Here a driver is
+a smooth random cost of the ground, a price of each place, the side on which obstacles are passed and a time to set out, none
+of which favours anything; it takes the cheapest way that satisfies the mission. As a family of trajectories this is
+perturb-and-MAP (Papandreou and Yuille, "Perturb-and-MAP Random Fields", ICCV 2011). No adversary is consulted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from tab_marl.mission.automaton import BEFORE_START
+from tab_marl.mission.fences import failing_regions, fences_crossed
+from tab_marl.mission.model import Mission
+from tab_marl.mission.route import solve_route
+from tab_marl.mission.route_kernels import MOVE_CELLS
+from tab_marl.planning.models import walk_kernels as kernels
+from tab_marl.planning.models.mission_map import MissionMap, Ways
+from tab_marl.world.grid import GridMap
+from tab_marl.world.regions import sample_in
+from tab_marl.world.scenario import Scenario
+
+STRENGTHS = (1.0, 0.5, 0.25, 0.0)
+"""Tried in turn until the mission leaves time for the way; at 0 a driver sets out at once on the shortest one."""
+
+
+@dataclass(frozen=True)
+class WaysOptions:
+    """What drivers differ in. Lengths in widths of the arena's shorter side."""
+
+    drivers: int = 150
+    starts_each: int = 2
+    """Starts drawn for each driver: so many ways have its preferences in common."""
+    cost_deviation: float = 1.0
+    """Standard deviation of the logarithm of what a metre costs."""
+    smooth_widths: float = 1 / 6
+    """Distance at which the correlation of that logarithm has fallen to exp(-1/2)."""
+    place_widths: float = 2.0
+    """The price of a place is uniform up to so much: with 2 the choice among places is nearly even."""
+    fence_widths: float = 0.5
+    """What half the drivers pay to pass an obstacle on the side on which the shortest way does."""
+    late_share: float = 0.25
+    """Of the ways that set out at a time drawn from all that the mission leaves; the others do at once."""
+
+    def __post_init__(self) -> None:
+        for name in ("drivers", "starts_each"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"WaysOptions.{name} is {getattr(self, name)}, must be >= 1")
+        for name in ("cost_deviation", "place_widths", "fence_widths"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
+                raise ValueError(f"WaysOptions.{name} is {getattr(self, name)}, must be finite and >= 0")
+        if not (math.isfinite(self.smooth_widths) and self.smooth_widths > 0):
+            raise ValueError(f"WaysOptions.smooth_widths is {self.smooth_widths}, must be finite and > 0")
+        if not 0 <= self.late_share <= 1:
+            raise ValueError(f"WaysOptions.late_share is {self.late_share}, must be a probability in 0..1")
+
+
+def draw_ways(
+    scenario: Scenario, mission: Mission, rng: np.random.Generator, options: WaysOptions | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Ways of ``N = drivers * starts_each`` drivers whom nobody hunts.
+
+    Returns positions ``[N, T + 1, 2]`` in metres at the ticks of `Scenario.step_seconds` (T: the horizon; it stays where its
+    mission ended), and the tick at which each completed its mission ``[N]``, or -1 where even the shortest way takes too long.
+    """
+    given = options or WaysOptions()
+    mission_map = MissionMap.build(scenario, mission)
+    smooth = given.smooth_widths * min(scenario.width_metres, scenario.height_metres)
+    costs = np.exp(given.cost_deviation * smooth_noise(mission_map.grid, given.drivers, smooth, rng))
+    count = given.drivers * given.starts_each
+    positions = np.empty((count, scenario.horizon_ticks + 1, 2))
+    completed = np.full(count, -1, dtype=np.int32)
+    for driver, cost in enumerate(costs):
+        rows = slice(driver * given.starts_each, (driver + 1) * given.starts_each)
+        _drive(mission_map, cost, given, rng, positions[rows], completed[rows])
+    return positions, completed
+
+
+def smooth_noise(grid: GridMap, count: int, metres: float, rng: np.random.Generator) -> NDArray[np.float64]:
+    """``[count, S]`` Gaussian fields of mean 0 and variance 1, whose correlation falls like ``exp(-(d / metres)^2 / 2)``.
+
+    The map is taken for a torus, so that the variance is the same everywhere.
+    """
+    deviation = metres / math.sqrt(2.0) / grid.cell_metres
+    white = rng.standard_normal((count, *grid.cell_at.shape))
+    smooth = ndimage.gaussian_filter(white, (0, deviation, deviation), mode="wrap")
+    variance = 1.0
+    for length in grid.cell_at.shape:
+        spread = ndimage.gaussian_filter1d(np.eye(1, length)[0], deviation, mode="wrap")
+        variance *= float((spread**2).sum())
+    return np.asarray(smooth[:, grid.row, grid.column] / math.sqrt(variance))
+
+
+def _drive(
+    mission_map: MissionMap,
+    cost: NDArray[np.float64],
+    options: WaysOptions,
+    rng: np.random.Generator,
+    positions: NDArray[np.float64],
+    completed: NDArray[np.int32],
+) -> None:
+    """Fill the ways ``[n, T + 1, 2]`` of one driver, to whom cells cost ``[S]``, and when they complete the mission ``[n]``."""
+    scenario, step, robot = mission_map.scenario, mission_map.scenario.step_seconds, mission_map.scenario.adversary
+    width = min(scenario.width_metres, scenario.height_metres)
+    prices = {place: rng.uniform(0.0, options.place_widths * width) for place in mission_map.automaton.branch_places}
+    fence = options.fence_widths * width if rng.random() < 0.5 else 0.0
+    starts = sample_in(scenario.adversary_start, rng, len(positions))
+    turning = rng.uniform(0.0, math.pi, len(positions)) / robot.max_turn_rate
+    late, share = rng.random(len(positions)) < options.late_share, rng.random(len(positions))
+    missing = range(len(positions))
+    for strength, ways in _weaker_and_weaker(mission_map, cost, prices, fence):
+        for i in missing:
+            delay = round(turning[i] / step) if strength else 0
+            if late[i] and strength:
+                delay = max(delay, int(share[i] * _spare_ticks(mission_map, ways, starts[i])))
+            completed[i] = _follow(mission_map, ways, starts[i], delay, positions[i])
+        missing = [i for i in missing if completed[i] < 0]
+        if not missing:
+            return
+
+
+def _weaker_and_weaker(
+    mission_map: MissionMap, cost: NDArray[np.float64], prices: dict[str, float], fence: float
+) -> Iterator[tuple[float, Ways]]:
+    """The cheapest ways to completion at each of STRENGTHS."""
+    automaton, grid = mission_map.automaton, mission_map.grid
+    crossed = _fences(mission_map, prices) if fence else 0.0
+    for strength in STRENGTHS:
+        edges = np.repeat((cost**strength)[:, None], 16, axis=1)
+        edges += strength * fence * crossed / (grid.cell_metres * MOVE_CELLS)
+        priced = {place: strength * metres for place, metres in prices.items()}
+        route = solve_route(automaton, grid, edges, place_metres=priced)
+        yield (
+            strength,
+            Ways(route.nearest, grid.cell_metres, grid.centres, route.next_cell, route.to_visit, route.length),
+        )
+
+
+def _fences(mission_map: MissionMap, prices: dict[str, float]) -> NDArray[np.int64] | float:
+    """``[S, 16]`` fences that moves cross, where the shortest way to the places chosen passes on its first leg."""
+    automaton, scenario = mission_map.automaton, mission_map.scenario
+    regions = [*scenario.obstacles, *failing_regions(automaton)]
+    start = scenario.adversary_start.centre
+    home = automaton.first(int(automaton.masks(start)[0])).location
+    if home < 0 or not regions:
+        return 0.0
+    cells, locations = solve_route(automaton, mission_map.grid, place_metres=prices).path(home, start)
+    leg = cells[: int(np.argmax(locations != home)) + 1]
+    return fences_crossed(mission_map.grid, regions, mission_map.grid.centres[leg])
+
+
+def _first(mission_map: MissionMap, start: NDArray[np.float64]) -> tuple[int, NDArray[np.int32]]:
+    """Location and clocks at tick 0."""
+    automaton, clocks = mission_map.automaton, np.array(BEFORE_START, dtype=np.int32)
+    mask = int(automaton.masks(start)[0])
+    return int(kernels.read_label(automaton.initial, clocks, mask, mission_map.rules)), clocks
+
+
+def _spare_ticks(mission_map: MissionMap, ways: Ways, start: NDArray[np.float64]) -> int:
+    m, (location, clocks) = mission_map, _first(mission_map, start)
+    return int(kernels.spare_ticks(*start, location, clocks, m.rules, ways, m.mission_latest, m.reach_metres))
+
+
+def _follow(
+    mission_map: MissionMap, ways: Ways, start: NDArray[np.float64], delay: int, positions: NDArray[np.float64]
+) -> int:
+    """Fill the way ``[T + 1, 2]`` of a driver who sets out after `delay` ticks; the tick of completion or -1."""
+    m, (location, clocks) = mission_map, _first(mission_map, start)
+    locations = np.empty(len(positions), dtype=np.int32)
+    states = np.empty((len(positions), 3), dtype=np.int32)
+    done = kernels.follow_way(
+        *start, location, clocks, delay, 1.0, m.reach_metres, m.rules, ways, m.ground, positions, locations, states
+    )
+    return int(done)
