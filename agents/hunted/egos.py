@@ -36,9 +36,12 @@ def hunter_names(opponent: str) -> tuple[str, ...]:
 
 
 def hunting_options() -> PlannerOptions:
-    """How planners plan while they hunt in training: with a seventh of the search of an evaluation."""
+    """How planners plan while they hunt in training: with a seventh of the search of an evaluation.
+
+    TAB-POMCP expects the field alone: ways drawn for every episode would take longer than the episode.
+    """
     return PlannerOptions(
-        pursuit=PursuitOptions.for_milliseconds(DECISION_MILLISECONDS), memory=PlannerMemory()
+        pursuit=PursuitOptions.for_milliseconds(DECISION_MILLISECONDS), memory=PlannerMemory(), ways=None
     )  # fmt: skip
 
 

@@ -57,7 +57,7 @@ def _episode(name: str, unit: Unit, policies: Sequence[str], base_seed: int, max
     policy = opponent(policies[unit.seed % len(policies)])
     head: dict[str, Any] = {"mission": unit.mission, "family": unit.family, "seed": unit.seed, "adversary": policy.name}
     try:
-        planner = make_planner("TAB-POMCP", PlannerOptions(tab_field=PLANNED[name]))
+        planner = make_planner("TAB-POMCP", PlannerOptions(tab_field=PLANNED[name], ways=None))
         played = run_episode(task, planner, policy, episode_seed, False, unit.seed, planner_seed, max_steps=max_steps)
     except ValueError as error:  # this field does not apply to this mission, or its motion is too slow for it
         return {**head, "completed": "", "physics_steps": "", "milliseconds": "", "error": str(error)}
