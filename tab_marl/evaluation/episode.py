@@ -25,6 +25,7 @@ from tab_marl.evaluation.rows import EpisodeRow, Timing
 from tab_marl.evaluation.units import Job, unit_seeds
 from tab_marl.field.problem import FieldOptions
 from tab_marl.mission.tasks import Task, ego_can_be_first, sample_task
+from tab_marl.planning.models.drawn_ways import WaysOptions
 from tab_marl.world.scenario import Scenario
 
 ADVERSARY_STREAM = 1
@@ -208,6 +209,7 @@ def play_unit(job: Job, trace: bool = False) -> list[Played]:
                     task = replace(task, scenario=free)
             options = PlannerOptions(
                 tab_field=FieldOptions.preset(job.planner_preset),
+                ways=None if job.planner_preset == "paper" else WaysOptions(),
                 rollouts=population(job.adversaries),
                 precedents=precedents(job.adversary),
             )
