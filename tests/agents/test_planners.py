@@ -13,7 +13,10 @@ from tab_marl.envs.ego_observation import observe_ego
 from tab_marl.envs.physics import Motion
 from tab_marl.mission.model import Constraint, Mission
 from tab_marl.mission.tasks import Task, sample_task
+from tab_marl.planning.models.drawn_ways import WaysOptions
+from tab_marl.planning.models.field_model import FieldModel
 from tab_marl.planning.models.mixture import Mixture
+from tab_marl.planning.models.pool import TrajectoryPool
 from tab_marl.planning.pursuit.decide import PursuitOptions
 from tab_marl.world.kernels import steer, unicycle_step
 from tab_marl.world.regions import Disc
@@ -170,7 +173,7 @@ def test_goal_places_are_waypoints_for_every_mission_type(mission: str) -> None:
 
 
 def test_with_precedents_the_belief_is_partly_theirs() -> None:
-    plain, shown = make_planner("TAB-POMCP", SMALL), make_planner(PRECEDENTS, SMALL)
+    plain, shown = make_planner("TAB-POMCP", replace(SMALL, ways=None)), make_planner(PRECEDENTS, SMALL)
     play(plain, WAIT, seed=3, seconds=3.0)
     play(shown, WAIT, seed=3, seconds=3.0)
     model = shown._model
@@ -178,6 +181,18 @@ def test_with_precedents_the_belief_is_partly_theirs() -> None:
     field, mixed = plain.belief_image(), shown.belief_image()
     assert 0 < model.weights[1] < 1 and np.nansum(mixed) == pytest.approx(1.0)
     assert np.nanmax(np.abs(mixed - field)) > 1e-4
+
+
+def test_tab_pomcp_expects_drawn_ways_beside_its_field_unless_told_not_to() -> None:
+    both, alone = make_planner("TAB-POMCP", SMALL), make_planner("TAB-POMCP", replace(SMALL, ways=None))
+    for agent in (both, alone):
+        play(agent, WAIT, seed=3, seconds=3.0)
+    assert isinstance(both._model, Mixture) and isinstance(alone._model, FieldModel)
+    field, ways = both._model.models
+    assert isinstance(field, FieldModel) and isinstance(ways, TrajectoryPool)
+    assert len(ways.positions) == WaysOptions().drivers * WaysOptions().starts_each
+    assert 0 < both._model.weights[1] < 1
+    assert np.nanmax(np.abs(both.belief_image() - alone.belief_image())) > 1e-4
 
 
 def test_unknown_planners_are_refused_with_the_nearest_name() -> None:
