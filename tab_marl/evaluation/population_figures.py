@@ -26,6 +26,7 @@ from tab_marl.field.problem import FieldProblem
 from tab_marl.field.solve import solve
 from tab_marl.mission import to_english
 from tab_marl.mission.tasks import Task
+from tab_marl.planning.models.drawn_ways import WaysOptions, draw_ways
 from tab_marl.world.regions import Box, Disc, Region
 from tab_marl.world.regions import Polygon as Outline
 
@@ -38,10 +39,10 @@ Array = NDArray[np.float64]
 
 
 def draw_paths(study: Study, y: Yardstick, target: Path, seed: int = 5) -> None:
-    """Small multiples: every policy, the scripted follower and the field on one task; colour is the time used."""
+    """Small multiples: every policy, the scripted follower and what TAB-POMCP expects on one task; colour is the time used."""
     players: list[AdversaryPolicy] = [*study.policies, ScriptedAdversary()]
     panels = [(p.name, _ways(p, y, seed)) for p in players]
-    panels.append(("TAB-Field", _sampled(y, seed)))
+    panels += [("TAB-Field", _sampled(y, seed)), ("drawn ways", _drawn(y, seed))]
     rows = -(-len(panels) // COLUMNS)
     figure, axes = plt.subplots(rows, COLUMNS, figsize=(1.75 * COLUMNS, 1.84 * rows + 0.75), dpi=110, squeeze=False)
     for axis in axes.flat:
@@ -50,7 +51,7 @@ def draw_paths(study: Study, y: Yardstick, target: Path, seed: int = 5) -> None:
         draw_map(axis, y.task)
         for path, share in ways:
             axis.plot(path[:, 0], path[:, 1], color=TIMES(min(share, 1.0)), lw=1.1, alpha=0.85, solid_capstyle="round")
-        baseline = name in ("scripted", "TAB-Field")
+        baseline = name in ("scripted", "TAB-Field", "drawn ways")
         axis.set_title(
             name, fontsize=8.5, color=FAINT if baseline else INK, style="italic" if baseline else "normal", pad=2
         )
@@ -131,6 +132,15 @@ def _sampled(y: Yardstick, seed: int) -> list[tuple[Array, float]]:
     return [
         (path[: end + 1], end * scenario.step_seconds / y.allowed_seconds)
         for path, end in zip(paths.positions, paths.completed_tick.tolist(), strict=True)
+    ]
+
+
+def _drawn(y: Yardstick, seed: int) -> list[tuple[Array, float]]:
+    scenario, options = y.task.scenario, WaysOptions(drivers=PATHS, starts_each=1)
+    positions, completed = draw_ways(scenario, y.task.mission, np.random.default_rng(seed), options)
+    return [
+        (path[: end + 1], end * scenario.step_seconds / y.allowed_seconds)
+        for path, end in zip(positions, completed.tolist(), strict=True)
     ]
 
 
