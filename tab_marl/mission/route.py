@@ -155,16 +155,25 @@ Tables = tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.bool_], NDArray[
 
 def _symbols(automaton: MissionAutomaton, grid: GridMap, place_metres: Mapping[str, float]) -> Tables:
     """Labels of cells as symbols ``[S]``, and per location and symbol: next location, progress, added metres."""
-    distinct, symbol = np.unique(automaton.masks(grid.centres), return_inverse=True)
-    fails = (automaton.next_location[:, distinct] == kernels.IMPASSABLE) | (automaton.forbidden_until[:, distinct] > 0)
-    table = np.where(fails, kernels.IMPASSABLE, automaton.next_location[:, distinct]).astype(np.int32)
+    distinct, symbol, table, progress = _labels(automaton, grid)
     extra = np.zeros(table.shape)
     for name, metres in place_metres.items():
         if metres < 0:
             raise ValueError(f"place_metres[{name!r}] is {metres}, must be >= 0")
         if name in automaton.branch_places:
             extra[automaton.branch[:, distinct] == automaton.branch_places.index(name)] = metres
-    return symbol.reshape(-1).astype(np.int32), table, np.ascontiguousarray(automaton.progress[:, distinct]), extra
+    return symbol, table, progress, extra
+
+
+@lru_cache(maxsize=16)
+def _labels(
+    automaton: MissionAutomaton, grid: GridMap
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], NDArray[np.bool_]]:
+    """The labels on the map ``[L]``, their numbers ``[S]``, and per location and label: next location, progress."""
+    distinct, symbol = np.unique(automaton.masks(grid.centres), return_inverse=True)
+    fails = (automaton.next_location[:, distinct] == kernels.IMPASSABLE) | (automaton.forbidden_until[:, distinct] > 0)
+    table = np.where(fails, kernels.IMPASSABLE, automaton.next_location[:, distinct]).astype(np.int32)
+    return distinct, symbol.reshape(-1).astype(np.int32), table, np.ascontiguousarray(automaton.progress[:, distinct])
 
 
 def _with_via(

@@ -114,13 +114,14 @@ def _drive(
     starts = sample_in(scenario.adversary_start, rng, len(positions))
     turning = rng.uniform(0.0, math.pi, len(positions)) / robot.max_turn_rate
     late, share = rng.random(len(positions)) < options.late_share, rng.random(len(positions))
+    begun = [_begun(mission_map, start) for start in starts]
     missing = range(len(positions))
     for strength, ways in _weaker_and_weaker(mission_map, cost, prices, fence):
         for i in missing:
             delay = round(turning[i] / step) if strength else 0
             if late[i] and strength:
-                delay = max(delay, int(share[i] * _spare_ticks(mission_map, ways, starts[i])))
-            completed[i] = _follow(mission_map, ways, starts[i], delay, positions[i])
+                delay = max(delay, int(share[i] * _spare_ticks(mission_map, ways, begun[i])))
+            completed[i] = _follow(mission_map, ways, begun[i], delay, positions[i])
         missing = [i for i in missing if completed[i] < 0]
         if not missing:
             return
@@ -156,23 +157,24 @@ def _fences(mission_map: MissionMap, prices: dict[str, float]) -> NDArray[np.int
     return fences_crossed(mission_map.grid, regions, mission_map.grid.centres[leg])
 
 
-def _first(mission_map: MissionMap, start: NDArray[np.float64]) -> tuple[int, NDArray[np.int32]]:
-    """Location and clocks at tick 0."""
+Begun = tuple[NDArray[np.float64], int, NDArray[np.int32]]
+"""A start ``[2]``, and the mission's location and clocks ``[3]`` at tick 0 there."""
+
+
+def _begun(mission_map: MissionMap, start: NDArray[np.float64]) -> Begun:
     automaton, clocks = mission_map.automaton, np.array(BEFORE_START, dtype=np.int32)
     mask = int(automaton.masks(start)[0])
-    return int(kernels.read_label(automaton.initial, clocks, mask, mission_map.rules)), clocks
+    return start, int(kernels.read_label(automaton.initial, clocks, mask, mission_map.rules)), clocks
 
 
-def _spare_ticks(mission_map: MissionMap, ways: Ways, start: NDArray[np.float64]) -> int:
-    m, (location, clocks) = mission_map, _first(mission_map, start)
+def _spare_ticks(mission_map: MissionMap, ways: Ways, begun: Begun) -> int:
+    m, (start, location, clocks) = mission_map, begun
     return int(kernels.spare_ticks(*start, location, clocks, m.rules, ways, m.mission_latest, m.reach_metres))
 
 
-def _follow(
-    mission_map: MissionMap, ways: Ways, start: NDArray[np.float64], delay: int, positions: NDArray[np.float64]
-) -> int:
+def _follow(mission_map: MissionMap, ways: Ways, begun: Begun, delay: int, positions: NDArray[np.float64]) -> int:
     """Fill the way ``[T + 1, 2]`` of a driver who sets out after `delay` ticks; the tick of completion or -1."""
-    m, (location, clocks) = mission_map, _first(mission_map, start)
+    m, (start, location, clocks) = mission_map, begun
     locations = np.empty(len(positions), dtype=np.int32)
     states = np.empty((len(positions), 3), dtype=np.int32)
     done = kernels.follow_way(
