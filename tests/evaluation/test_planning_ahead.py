@@ -65,12 +65,12 @@ def timing(seconds):
 
 def test_time_from_stored_episodes_from_measuring_and_from_nothing():
     missing = [("M1", "point", "TAB-POMCP", s) for s in range(10)] + [("M2", "point", "S-POMCP", s) for s in range(10)]
-    stored = {("M1", "point", "TAB-POMCP", 90): timing(2 * 0.39), ("M1", "point", "TAB-POMCP", 91): timing(4 * 0.39)}
+    stored = {("M1", "point", "TAB-POMCP", 90): timing(2 * 0.78), ("M1", "point", "TAB-POMCP", 91): timing(4 * 0.78)}
     known = ahead.estimate(missing, stored)
     # M1's mean is three times the reference, so M2 of another planner is taken to be as well.
-    assert known.processor_seconds == pytest.approx(3 * (10 * 0.39 + 10 * 1.00))
+    assert known.processor_seconds == pytest.approx(3 * (10 * 0.78 + 10 * 1.00))
     assert known.seconds(2) == pytest.approx(known.processor_seconds / 2) and "2 stored" in known.source
-    assert ahead.estimate(missing, {}, speed=2.0).processor_seconds == pytest.approx(2 * (10 * 0.39 + 10 * 1.00))
+    assert ahead.estimate(missing, {}, speed=2.0).processor_seconds == pytest.approx(2 * (10 * 0.78 + 10 * 1.00))
     assert ahead.estimate(missing, {}).source == "from another machine's figures"
     assert ahead.speed_of(2 * ahead.REFERENCE_DECISION_MILLISECONDS) == 2.0
 
