@@ -115,7 +115,7 @@ def _drive(
     turning = rng.uniform(0.0, math.pi, len(positions)) / robot.max_turn_rate
     late, share = rng.random(len(positions)) < options.late_share, rng.random(len(positions))
     begun = [_begun(mission_map, start) for start in starts]
-    missing = range(len(positions))
+    missing = list(range(len(positions)))
     for strength, ways in _weaker_and_weaker(mission_map, cost, prices, fence):
         for i in missing:
             delay = round(turning[i] / step) if strength else 0
@@ -168,16 +168,16 @@ def _begun(mission_map: MissionMap, start: NDArray[np.float64]) -> Begun:
 
 
 def _spare_ticks(mission_map: MissionMap, ways: Ways, begun: Begun) -> int:
-    m, (start, location, clocks) = mission_map, begun
-    return int(kernels.spare_ticks(*start, location, clocks, m.rules, ways, m.mission_latest, m.reach_metres))
+    m, ((x, y), location, clocks) = mission_map, begun
+    return int(kernels.spare_ticks(x, y, location, clocks, m.rules, ways, m.mission_latest, m.reach_metres))
 
 
 def _follow(mission_map: MissionMap, ways: Ways, begun: Begun, delay: int, positions: NDArray[np.float64]) -> int:
     """Fill the way ``[T + 1, 2]`` of a driver who sets out after `delay` ticks; the tick of completion or -1."""
-    m, (start, location, clocks) = mission_map, begun
+    m, ((x, y), location, clocks) = mission_map, begun
     locations = np.empty(len(positions), dtype=np.int32)
     states = np.empty((len(positions), 3), dtype=np.int32)
     done = kernels.follow_way(
-        *start, location, clocks, delay, 1.0, m.reach_metres, m.rules, ways, m.ground, positions, locations, states
+        x, y, location, clocks, delay, 1.0, m.reach_metres, m.rules, ways, m.ground, positions, locations, states
     )
     return int(done)
