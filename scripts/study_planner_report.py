@@ -22,7 +22,11 @@ Cell = dict[str, dict[int, Row]]
 PARTS = ("belief_ms", "sampling_ms", "valuation_ms", "search_ms")
 LINES = {"population": "#2a9d8f", "oracle": "#6c757d"}
 DASHES = {"population": "-", "oracle": "--"}
-MARKS = {"er": ("er", "#e07a1f", "s"), "routes": ("routes", "#8e5bb5", "D")}
+MARKS = {
+    "er": ("er", "#e07a1f", "s"),
+    "routes": ("routes", "#8e5bb5", "D"),
+    "TAB-POMCP": ("TAB-POMCP: drawn ways beside the field", "#c0392b", "*"),
+}
 
 
 def read(rows: Path) -> dict[tuple[str, str], Cell]:
@@ -99,11 +103,21 @@ def draw(panels: list[tuple[str, Cell]], out: Path) -> None:
             [100 * (missed[v].value - missed[v].low) for v in trees],
             [100 * (missed[v].high - missed[v].value) for v in trees],
         ]
-        axis.errorbar(x, y, yerr=bars, color="#1d5fa8", marker="o", ms=4, lw=1.5, capsize=2, label="TAB-POMCP, tree")
+        axis.errorbar(
+            x, y, yerr=bars, color="#1d5fa8", marker="o", ms=4, lw=1.5, capsize=2, label="tree, the field alone"
+        )
         for variant, (name, colour, marker) in MARKS.items():
             if variant in missed:
                 spent = milliseconds(cell[variant]).sum()
-                axis.plot(spent, 100 * missed[variant].value, marker, color=colour, ms=6, ls="none", label=name)
+                axis.plot(
+                    spent,
+                    100 * missed[variant].value,
+                    marker,
+                    color=colour,
+                    ms=9 if marker == "*" else 6,
+                    ls="none",
+                    label=name,
+                )
         axis.set(xscale="log", title=f"{title}, n = {len(seeds)}", xlabel="milliseconds a decision")
         axis.set(xlim=(1, 1500), ylim=(-2, 45), xticks=[1, 10, 100, 1000], xticklabels=["1", "10", "100", "1,000"])
         axis.grid(alpha=0.25)
