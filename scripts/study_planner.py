@@ -70,6 +70,10 @@ VARIANTS: dict[str, Variant] = {
     **{f"tree {effort.milliseconds:g} ms": pursuing("TAB-POMCP", effort.milliseconds) for effort in EFFORT},
     "TAB-POMCP": drawing(),
     "TAB-POMCP 50 ms": drawing(50),
+    "TAB-POMCP, habits half as strong": drawing(
+        cost_deviation=0.5, smooth_widths=1 / 3, place_widths=1.0, fence_widths=0.25
+    ),
+    "TAB-POMCP, twice as strong": drawing(cost_deviation=2.0, smooth_widths=1 / 12, place_widths=4.0, fence_widths=1.0),
     "TAB-POMCP, no late ways": drawing(late_share=0.0),
     "TAB-POMCP, shortest sides": drawing(fence_widths=0.0),
     "TAB-POMCP, even ground": drawing(cost_deviation=0.0),
