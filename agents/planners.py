@@ -8,8 +8,8 @@ name                  adversary model
 S-POMCP               uniform random moves within the speed limit
 FP-POMCP              the shortest path to the mission's objectives at full speed
 MLE-POMCP             moves counted from sightings of the development policies and of this episode, kept feasible
-TAB-POMCP             the TAB-Field under two references, whichever foresees better: run-and-tumble (its bridge kernel), and
-                      drivers with habits drawn at random (`tab_marl.planning.models.drawn_ways`)
+TAB-POMCP             the TAB-Field's bridge kernel, or drivers with habits drawn at random
+                      (`tab_marl.planning.models.drawn_ways`): whichever foresees better
 TAB-POMCP+precedents  the TAB-Field's bridge kernel, or as other policies (those for development) drove on this task
 oracle                the TAB-Field's bridge kernel, and the adversary is always seen (environment option `full_observation`)
 population-POMCP      trajectories of the very policies that may be played, weighted by what was seen: a ceiling

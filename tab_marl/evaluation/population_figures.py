@@ -141,6 +141,7 @@ def _drawn(y: Yardstick, seed: int) -> list[tuple[Array, float]]:
     return [
         (path[: end + 1], end * scenario.step_seconds / y.allowed_seconds)
         for path, end in zip(positions, completed.tolist(), strict=True)
+        if end >= 0
     ]
 
 

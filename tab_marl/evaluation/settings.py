@@ -54,7 +54,7 @@ class EvaluationSettings:
     slack: float | None = None
     """Allowed time over shortest time; None draws one per task."""
     planner_preset: Literal["default", "paper"] = "default"
-    """`paper` plans with the literal field and without the price of a completed mission."""
+    """`paper` plans with the literal field, without drawn ways and without the price of a completed mission."""
     workers: int | None = None
     """Processes; None means one per processor core."""
     replays: int = 3

@@ -12,7 +12,7 @@ from tab_marl.mission.tasks import sample_task
 from tab_marl.planning.models.drawn_ways import WaysOptions, draw_ways, smooth_noise
 from tab_marl.planning.models.mission_map import MissionMap
 from tab_marl.world.grid import GridMap, free_points
-from tab_marl.world.regions import Disc
+from tab_marl.world.regions import Box, Disc
 from tab_marl.world.scenario import Checkpoint, Scenario
 
 RNG = np.random.default_rng
@@ -100,8 +100,8 @@ def test_prices_share_the_choice_of_places() -> None:
         nearest = np.hypot(*(at[:, None] - places).transpose(2, 0, 1)).argmin(axis=1)
         ends[widths] = np.bincount(nearest, minlength=3) / 300
     assert ends[0.0][2] == 1.0
-    # The near place is 0.8 m from the start, the far ones 2.2 m: with prices uniform over 6 m it is cheapest for
-    # P(u0 + 0.8 < min(u1, u2) + 2.2) = 0.55, by integration.
+    # The near place is 0.8 m from the start, the far ones 2.3 m: with prices uniform over 6 m it is cheapest for
+    # P(u0 + 0.8 < min(u1, u2) + 2.3) = 0.58, by integration.
     assert ends[2.0][2] == pytest.approx(_nearest_share(0.8, 2.3, 6.0), abs=0.08)
     assert ends[2.0][0] == pytest.approx(ends[2.0][1], abs=0.08)
 
@@ -142,6 +142,15 @@ def test_where_time_is_short_habits_give_way_to_the_mission() -> None:
     assert (completed > 0).mean() > 0.9
     _, completed = draw_ways(PILLAR, deadline(0.5 * shortest / PILLAR.adversary.max_speed, "A"), RNG(7), FEW)
     assert (completed == -1).all()
+
+
+def test_starts_in_obstacles_move_out_and_missions_that_are_over_end_at_once() -> None:
+    anywhere = replace(PILLAR, adversary_start=Box(0.2, 0.2, 2.8, 2.8))
+    positions, _ = draw_ways(anywhere, deadline(50.0, "A", "B", "C"), RNG(9), replace(FEW, drivers=60))
+    assert free_points(anywhere, positions[:, 0], 0.0).all()
+    there = replace(OPEN, adversary_start=Disc(0.4, 2.6, 0.05))
+    positions, completed = draw_ways(there, deadline(20.0, "A"), RNG(9), FEW)
+    assert (completed == 0).all() and (positions == positions[:, :1]).all()
 
 
 def test_the_same_seed_draws_the_same_ways() -> None:

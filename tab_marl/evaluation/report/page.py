@@ -27,10 +27,10 @@ MODELS = {
     "S-POMCP": "moves at random, as far as its motors allow",
     "FP-POMCP": "takes the shortest path to its mission’s goals",
     "MLE-POMCP": "moves as other learned adversaries were seen to, and as it was seen to so far, as far as its mission allows",
-    "TAB-POMCP": "anything that completes the mission, no way preferred without reason: the TAB-Field of a driver who tumbles, "
-    "and of drivers with habits drawn at random; whichever foresees better",
-    "TAB-POMCP+precedents": "as the TAB-Field of a driver who tumbles says, or drives as other learned adversaries did on such "
-    "tasks: whichever foresees better",
+    "TAB-POMCP": "anything that completes the mission, no way preferred without reason (the TAB-Field), or drives as habits "
+    "have it that are drawn at random: whichever foresees better",
+    "TAB-POMCP+precedents": "as the TAB-Field has it, or drives as other learned adversaries did on such tasks: whichever "
+    "foresees better",
     "population-POMCP": "moves as the population of trained adversaries does: not available outside an experiment",
     "oracle": "is seen all the time: the bound on what can be reached",
     "random": "none; the ego drives at random",

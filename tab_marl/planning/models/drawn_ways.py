@@ -2,8 +2,9 @@
 
 A field's reference process tumbles: it knows no driver who keeps to a way because of a preference that lasts. Here a driver is
 a smooth random cost of the ground, a price of each place, the side on which obstacles are passed and a time to set out, none
-of which favours anything; it takes the cheapest way that satisfies the mission. As a family of trajectories this is
-perturb-and-MAP (Papandreou and Yuille, "Perturb-and-MAP Random Fields", ICCV 2011). No adversary is consulted.
+of which favours a way before it is drawn; it takes the cheapest way that satisfies the mission, in the manner of
+perturb-and-MAP (Papandreou and Yuille, "Perturb-and-MAP Random Fields", ICCV 2011). No policy is consulted; how strong habits
+are is as in the styles of `tab_marl.envs.styles`.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from tab_marl.mission.automaton import BEFORE_START
+from tab_marl.mission.automaton import BEFORE_START, COMPLETED
 from tab_marl.mission.fences import failing_regions, fences_crossed
 from tab_marl.mission.model import Mission
 from tab_marl.mission.route import solve_route
 from tab_marl.mission.route_kernels import MOVE_CELLS
 from tab_marl.planning.models import walk_kernels as kernels
 from tab_marl.planning.models.mission_map import MissionMap, Ways
-from tab_marl.world.grid import GridMap
+from tab_marl.world.grid import GridMap, free_points
 from tab_marl.world.regions import sample_in
 from tab_marl.world.scenario import Scenario
 
@@ -69,6 +70,7 @@ def draw_ways(
 
     Returns positions ``[N, T + 1, 2]`` in metres at the ticks of `Scenario.step_seconds` (T: the horizon; it stays where its
     mission ended), and the tick at which each completed its mission ``[N]``, or -1 where even the shortest way takes too long.
+    Labels are read on the squares of `MissionMap`, so a way may pass a place's edge by a centimetre on the wrong side.
     """
     given = options or WaysOptions()
     mission_map = MissionMap.build(scenario, mission)
@@ -111,11 +113,18 @@ def _drive(
     width = min(scenario.width_metres, scenario.height_metres)
     prices = {place: rng.uniform(0.0, options.place_widths * width) for place in mission_map.automaton.branch_places}
     fence = options.fence_widths * width if rng.random() < 0.5 else 0.0
-    starts = sample_in(scenario.adversary_start, rng, len(positions))
+    starts, grid = sample_in(scenario.adversary_start, rng, len(positions)), mission_map.grid
+    clear = free_points(scenario, starts, 0.0)
+    starts = np.where(clear[:, None], starts, grid.centres[grid.cells_of(starts)])
     turning = rng.uniform(0.0, math.pi, len(positions)) / robot.max_turn_rate
     late, share = rng.random(len(positions)) < options.late_share, rng.random(len(positions))
     begun = [_begun(mission_map, start) for start in starts]
-    missing = list(range(len(positions)))
+    over = [location < 0 for _, location, _ in begun]
+    for i in np.flatnonzero(over):  # at the start already
+        positions[i], completed[i] = starts[i], 0 if begun[i][1] == COMPLETED else -1
+    missing = [i for i in range(len(positions)) if not over[i]]
+    if not missing:
+        return
     for strength, ways in _weaker_and_weaker(mission_map, cost, prices, fence):
         for i in missing:
             delay = round(turning[i] / step) if strength else 0
@@ -145,7 +154,9 @@ def _weaker_and_weaker(
 
 
 def _fences(mission_map: MissionMap, prices: dict[str, float]) -> NDArray[np.int64] | float:
-    """``[S, 16]`` fences that moves cross, where the shortest way to the places chosen passes on its first leg."""
+    """``[S, 16]`` fences that moves cross: the shortest way to the places chosen, from the middle of the start region, crosses
+    them on its first leg.
+    """
     automaton, scenario = mission_map.automaton, mission_map.scenario
     regions = [*scenario.obstacles, *failing_regions(automaton)]
     start = scenario.adversary_start.centre

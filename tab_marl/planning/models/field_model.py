@@ -1,4 +1,4 @@
-"""TAB-POMCP's adversary: the TAB-Field, solved once per mission and filtered exactly on everything seen and not seen."""
+"""Half of TAB-POMCP's adversary: the TAB-Field, solved once per mission and filtered exactly on everything seen and not seen."""
 
 from __future__ import annotations
 

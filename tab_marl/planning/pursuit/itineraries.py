@@ -82,7 +82,7 @@ class PursuitOptions:
         """The options whose decisions take about so long on one core (2026), the belief's update of about 1 ms included.
 
         Work is set, not time: the same seed gives the same decision on every machine, and missions differ (50 ms takes
-        TAB-POMCP 31 to 66, docs/studies/planner.md). `EFFORT` lists the steps; the dearest that fits is taken, the
+        TAB-POMCP with its field alone 31 to 66, docs/studies/planner.md). `EFFORT` lists the steps; the dearest that fits is taken, the
         cheapest if none does.
         """
         fitting = [effort for effort in EFFORT if effort.milliseconds <= milliseconds] or [EFFORT[0]]
