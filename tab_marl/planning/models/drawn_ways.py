@@ -119,10 +119,13 @@ def _drive(
     turning = rng.uniform(0.0, math.pi, len(positions)) / robot.max_turn_rate
     late, share = rng.random(len(positions)) < options.late_share, rng.random(len(positions))
     begun = [_begun(mission_map, start) for start in starts]
-    over = [location < 0 for _, location, _ in begun]
-    for i in np.flatnonzero(over):  # at the start already
-        positions[i], completed[i] = starts[i], 0 if begun[i][1] == COMPLETED else -1
-    missing = [i for i in range(len(positions)) if not over[i]]
+    missing = []
+    for i, (start, location, _) in enumerate(begun):
+        if location >= 0:
+            missing.append(i)
+        else:  # over at the start already
+            positions[i] = start
+            completed[i] = 0 if location == COMPLETED else -1
     if not missing:
         return
     for strength, ways in _weaker_and_weaker(mission_map, cost, prices, fence):
