@@ -42,7 +42,7 @@ from tab_marl.envs.reward import Gained
 from tab_marl.envs.styles import SLACK_NEEDED, STRENGTHS, Latents, Style, clearance_cost, styled_cost
 from tab_marl.mission.automaton import COMPLETED, FAILED, UNBOUNDED, MissionAutomaton
 from tab_marl.mission.compile import compile_mission
-from tab_marl.mission.fences import failing_regions, fences_crossed
+from tab_marl.mission.fences import failing_regions, fences_of_first_leg
 from tab_marl.mission.model import Mission
 from tab_marl.mission.route import RouteField, solve_route
 from tab_marl.world.grid import GridMap
@@ -200,11 +200,9 @@ def _styled(plain: _Plain, latents: Latents) -> Parts:
 
 def _crossed(plain: _Plain, place_metres: dict[str, float]) -> NDArray[np.int64]:
     """``[S, 16]``: fences across the first leg of the shortest way to the places chosen if they cost so much more."""
-    grid = plain.route.grid
-    chosen = solve_route(plain.automaton, grid, plain.clearance, place_metres=place_metres)
-    cells, locations = chosen.path(plain.home, plain.scenario.adversary_start.centre)
-    leg = grid.centres[cells[: int(np.argmax(locations != plain.home)) + 1]]
-    return fences_crossed(grid, [*plain.scenario.obstacles, *plain.failing], leg)
+    chosen = solve_route(plain.automaton, plain.route.grid, plain.clearance, place_metres=place_metres)
+    regions = [*plain.scenario.obstacles, *plain.failing]
+    return fences_of_first_leg(chosen, plain.home, plain.scenario.adversary_start.centre, regions)
 
 
 def _via_points(

@@ -25,7 +25,7 @@ DASHES = {"population": "-", "oracle": "--"}
 MARKS = {
     "er": ("er", "#e07a1f", "s"),
     "routes": ("routes", "#8e5bb5", "D"),
-    "TAB-POMCP": ("TAB-POMCP: drawn ways beside the field", "#c0392b", "*"),
+    "TAB-POMCP": ("TAB-POMCP: drawn ways beside the field", "#c0392b", "P"),
 }
 
 
@@ -109,15 +109,7 @@ def draw(panels: list[tuple[str, Cell]], out: Path) -> None:
         for variant, (name, colour, marker) in MARKS.items():
             if variant in missed:
                 spent = milliseconds(cell[variant]).sum()
-                axis.plot(
-                    spent,
-                    100 * missed[variant].value,
-                    marker,
-                    color=colour,
-                    ms=9 if marker == "*" else 6,
-                    ls="none",
-                    label=name,
-                )
+                axis.plot(spent, 100 * missed[variant].value, marker, color=colour, ms=6, ls="none", label=name)
         axis.set(xscale="log", title=f"{title}, n = {len(seeds)}", xlabel="milliseconds a decision")
         axis.set(xlim=(1, 1500), ylim=(-2, 45), xticks=[1, 10, 100, 1000], xticklabels=["1", "10", "100", "1,000"])
         axis.grid(alpha=0.25)

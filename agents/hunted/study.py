@@ -62,8 +62,8 @@ def study(
     """Every policy against every ego on the same `count` held-out tasks of a family, missions in turn, from the same starts.
 
     `policies`: by name, with the style to play in. `options`: the planners' (default: those of an evaluation, but TAB-POMCP
-    expects the field alone, as in training). `on_block`
-    is called with the rows of every BLOCK tasks. `first`: the task to begin with, where the ones before are known.
+    expects the field alone, as in training). `on_block` is called with the rows of every BLOCK tasks. `first`: the task to
+    begin with, where the ones before are known.
     """
     tasks = draw_tasks(HELD_OUT, seed, count, MISSION_IDS, (family,))
     rows: list[HuntedRow] = []

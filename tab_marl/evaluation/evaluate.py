@@ -161,7 +161,9 @@ def _announce(experiment: Experiment, store: Store, manner: Manner, notes: Conso
 
 
 def measured_decision_milliseconds() -> float:
-    """Processor time of a decision of TAB-POMCP, with its field alone, on M1, here and now: two short episodes, the first to load the kernels."""
+    """Processor time of a decision of TAB-POMCP, with its field alone, on M1, here and now: two short episodes, the first
+    to load the kernels.
+    """
     import numpy as np
 
     from tab_marl.agents.adversaries import ScriptedAdversary

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tab_marl.mission.automaton import FAILED, MissionAutomaton
+from tab_marl.mission.route import RouteField
 from tab_marl.mission.route_kernels import MOVE_CELLS, MOVE_X, MOVE_Y
 from tab_marl.world.grid import GridMap
 from tab_marl.world.regions import Region
@@ -22,6 +23,16 @@ def zones(automaton: MissionAutomaton) -> NDArray[np.bool_]:
 def failing_regions(automaton: MissionAutomaton) -> tuple[Region, ...]:
     """Regions that fail the mission at some of its locations."""
     return tuple(region for region, fails in zip(automaton.regions, zones(automaton).T, strict=True) if fails.any())
+
+
+def fences_of_first_leg(
+    chosen: RouteField, home: int, start: ArrayLike, regions: Sequence[Region]
+) -> NDArray[np.int64]:
+    """``[S, 16]``: how many fences a move crosses that stand across the chosen way, from the start ``[2]`` at location `home`
+    to where that location ends."""
+    cells, locations = chosen.path(home, start)
+    leg = cells[: int(np.argmax(locations != home)) + 1]
+    return fences_crossed(chosen.grid, regions, chosen.grid.centres[leg])
 
 
 def fences_crossed(grid: GridMap, regions: Sequence[Region], way: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from tab_marl.mission.automaton import BEFORE_START, COMPLETED
-from tab_marl.mission.fences import failing_regions, fences_crossed
+from tab_marl.mission.fences import failing_regions, fences_of_first_leg
 from tab_marl.mission.model import Mission
 from tab_marl.mission.route import solve_route
 from tab_marl.mission.route_kernels import MOVE_CELLS
@@ -44,7 +44,7 @@ class WaysOptions:
     smooth_widths: float = 1 / 6
     """Distance at which the correlation of that logarithm has fallen to exp(-1/2)."""
     place_widths: float = 2.0
-    """The price of a place is uniform up to so much: with 2 the choice among places is nearly even."""
+    """The price of a place is uniform up to so much, so that far places are chosen as well, near ones more often."""
     fence_widths: float = 0.5
     """What half the drivers pay to pass an obstacle on the side on which the shortest way does."""
     late_share: float = 0.25
@@ -72,9 +72,8 @@ def draw_ways(
     mission ended), and the tick at which each completed its mission ``[N]``, or -1 where even the shortest way takes too long.
     Labels are read on the squares of `MissionMap`, so a way may pass a place's edge by a centimetre on the wrong side.
     """
-    given = options or WaysOptions()
-    mission_map = MissionMap.build(scenario, mission)
-    smooth = given.smooth_widths * min(scenario.width_metres, scenario.height_metres)
+    given, mission_map = options or WaysOptions(), MissionMap.build(scenario, mission)
+    smooth = given.smooth_widths * _width_metres(scenario)
     costs = np.exp(given.cost_deviation * smooth_noise(mission_map.grid, given.drivers, smooth, rng))
     count = given.drivers * given.starts_each
     positions = np.empty((count, scenario.horizon_ticks + 1, 2))
@@ -83,6 +82,11 @@ def draw_ways(
         rows = slice(driver * given.starts_each, (driver + 1) * given.starts_each)
         _drive(mission_map, cost, given, rng, positions[rows], completed[rows])
     return positions, completed
+
+
+def _width_metres(scenario: Scenario) -> float:
+    """What lengths in the options are widths of."""
+    return min(scenario.width_metres, scenario.height_metres)
 
 
 def smooth_noise(grid: GridMap, count: int, metres: float, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -110,7 +114,7 @@ def _drive(
 ) -> None:
     """Fill the ways ``[n, T + 1, 2]`` of one driver, to whom cells cost ``[S]``, and when they complete the mission ``[n]``."""
     scenario, step, robot = mission_map.scenario, mission_map.scenario.step_seconds, mission_map.scenario.adversary
-    width = min(scenario.width_metres, scenario.height_metres)
+    width = _width_metres(scenario)
     prices = {place: rng.uniform(0.0, options.place_widths * width) for place in mission_map.automaton.branch_places}
     fence = options.fence_widths * width if rng.random() < 0.5 else 0.0
     starts, grid = sample_in(scenario.adversary_start, rng, len(positions)), mission_map.grid
@@ -144,7 +148,7 @@ def _weaker_and_weaker(
 ) -> Iterator[tuple[float, Ways]]:
     """The cheapest ways to completion at each of STRENGTHS."""
     automaton, grid = mission_map.automaton, mission_map.grid
-    crossed = _fences(mission_map, prices) if fence else 0.0
+    crossed = _fences(mission_map, prices) if fence else np.zeros((grid.cells, 16), dtype=np.int64)
     for strength in STRENGTHS:
         edges = np.repeat((cost**strength)[:, None], 16, axis=1)
         edges += strength * fence * crossed / (grid.cell_metres * MOVE_CELLS)
@@ -156,19 +160,14 @@ def _weaker_and_weaker(
         )
 
 
-def _fences(mission_map: MissionMap, prices: dict[str, float]) -> NDArray[np.int64] | float:
-    """``[S, 16]`` fences that moves cross: the shortest way to the places chosen, from the middle of the start region, crosses
-    them on its first leg.
-    """
-    automaton, scenario = mission_map.automaton, mission_map.scenario
-    regions = [*scenario.obstacles, *failing_regions(automaton)]
-    start = scenario.adversary_start.centre
-    home = automaton.first(int(automaton.masks(start)[0])).location
-    if home < 0 or not regions:
-        return 0.0
-    cells, locations = solve_route(automaton, mission_map.grid, place_metres=prices).path(home, start)
-    leg = cells[: int(np.argmax(locations != home)) + 1]
-    return fences_crossed(mission_map.grid, regions, mission_map.grid.centres[leg])
+def _fences(mission_map: MissionMap, prices: dict[str, float]) -> NDArray[np.int64]:
+    """``[S, 16]``: fences across the first leg of the shortest way to the places chosen, from the middle of the start region."""
+    automaton, scenario, grid = mission_map.automaton, mission_map.scenario, mission_map.grid
+    start, home, _ = _begun(mission_map, np.asarray(scenario.adversary_start.centre))
+    if home < 0:
+        return np.zeros((grid.cells, 16), dtype=np.int64)
+    chosen = solve_route(automaton, grid, place_metres=prices)
+    return fences_of_first_leg(chosen, home, start, [*scenario.obstacles, *failing_regions(automaton)])
 
 
 Begun = tuple[NDArray[np.float64], int, NDArray[np.int32]]
